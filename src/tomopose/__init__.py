@@ -1,0 +1,39 @@
+"""tomopose: pose calibration for X-ray tomography.
+
+From radiographs of one ball on a 6-DOF manipulator to projection matrices of any 3D scan trajectory, with uncertainty.
+Names are imported when they are first used, so that `import tomopose` stays light.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+_HOME = {
+    "BallObservations": "tomopose.observations",
+    "Calibration": "tomopose.calibration.result",
+    "Frame": "tomopose.geometry.frames",
+    "PoseSequence": "tomopose.manipulator.poses",
+    "ProjectionMatrices": "tomopose.geometry.projection",
+    "RigidTransform": "tomopose.geometry.transforms",
+    "Scanner": "tomopose.geometry.scanner",
+    "TomoposeError": "tomopose.errors",
+}
+
+__all__ = sorted(_HOME)
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from tomopose.provenance import package_version
+
+        return package_version()
+    try:
+        module = _HOME[name]
+    except KeyError:
+        raise AttributeError(f"module 'tomopose' has no attribute {name!r}") from None
+    return getattr(importlib.import_module(module), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

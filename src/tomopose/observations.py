@@ -1,0 +1,129 @@
+"""Observations of the ball: where its centre is projected in each radiograph, with its uncertainty, or why not."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from tomopose.errors import InputError, ShapeError
+from tomopose.units import Array, float_array
+
+OPTIONAL_COLUMNS = ("snr", "semi_major", "semi_minor", "angle")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BallObservations:
+    """One row per image.
+
+    x_D:        (n, 2) px in D, projection of the ball's *centre*; NaN where not seen.
+    covariance: (n, 2, 2) px^2.
+    pose_id:    n different names.
+    seen:       (n,) bool: measured and fit for use.
+    status:     n short words: "ok", or why the row is not to be used or is to be used with care.
+    image:      n file names, or None.
+    snr, semi_major, semi_minor, angle: (n,) background SNR, silhouette ellipse (px, px, rad), NaN where unknown.
+    x_ellipse:  (n, 2) px, centre of the silhouette's ellipse: *not* the projected centre (paper ref. [19]).
+    """
+
+    x_D: Array
+    covariance: Array
+    pose_id: tuple[str, ...]
+    seen: Any = None
+    status: tuple[str, ...] | None = None
+    image: tuple[str, ...] | None = None
+    snr: Array | None = None
+    semi_major: Array | None = None
+    semi_minor: Array | None = None
+    angle: Array | None = None
+    x_ellipse: Array | None = None
+
+    def __post_init__(self) -> None:
+        x_D, covariance = float_array(self.x_D), float_array(self.covariance)
+        n = len(x_D)
+        if x_D.shape != (n, 2) or covariance.shape != (n, 2, 2):
+            raise ShapeError(
+                f"observations need x_D (n, 2) and covariance (n, 2, 2); got {x_D.shape} and {covariance.shape}"
+            )
+        ids = tuple(str(i) for i in self.pose_id)
+        if len(ids) != n:
+            raise ShapeError(f"{n} observations but {len(ids)} pose ids")
+        twice = [i for i, count in Counter(ids).items() if count > 1]
+        if twice:
+            raise InputError(f"pose_id {twice[0]!r} is observed more than once ({len(twice)} ids repeat)")
+        finite = np.isfinite(x_D).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+        seen = finite.copy() if self.seen is None else np.array(self.seen, dtype=bool)
+        if seen.shape != (n,):
+            raise ShapeError(f"seen has shape {seen.shape}; one value for each of {n} observations is needed")
+        bad = np.flatnonzero(seen & ~finite)
+        if bad.size:
+            raise InputError(f"observation of pose {ids[bad[0]]!r} counts as seen but is not a finite number")
+        variance = np.einsum("nii->ni", covariance)
+        bad = np.flatnonzero(seen & ((variance <= 0).any(axis=1) | (np.linalg.det(np.where(
+            seen[:, None, None], covariance, np.eye(2))) <= 0)))
+        if bad.size:
+            raise InputError(f"observation of pose {ids[bad[0]]!r}: its covariance is not positive definite")
+        seen.setflags(write=False)
+        status = tuple("ok" if s else "not seen" for s in seen) if self.status is None else tuple(self.status)
+        if len(status) != n:
+            raise ShapeError(f"{n} observations but {len(status)} status words")
+        object.__setattr__(self, "x_D", x_D)
+        object.__setattr__(self, "covariance", covariance)
+        object.__setattr__(self, "pose_id", ids)
+        object.__setattr__(self, "seen", seen)
+        object.__setattr__(self, "status", status)
+        if self.image is not None:
+            if len(self.image) != n:
+                raise ShapeError(f"{n} observations but {len(self.image)} image names")
+            object.__setattr__(self, "image", tuple(self.image))
+        for name in (*OPTIONAL_COLUMNS, "x_ellipse"):
+            column = getattr(self, name)
+            if column is not None:
+                array = float_array(column)
+                if len(array) != n:
+                    raise ShapeError(f"{n} observations but {len(array)} values of {name}")
+                object.__setattr__(self, name, array)
+
+    @classmethod
+    def from_sigma(cls, x_D: Any, sigma: Any, *, pose_id: Any = None, **columns: Any) -> BallObservations:
+        """From centres (n, 2) and standard uncertainties (a number, (n,) or (n, 2)), px, without correlation."""
+        x_D = np.asarray(x_D, dtype=np.float64)
+        s = np.asarray(sigma, dtype=np.float64)
+        s = np.broadcast_to(s[:, None] if s.ndim == 1 else s, x_D.shape)
+        covariance = np.zeros((len(x_D), 2, 2))
+        covariance[:, 0, 0], covariance[:, 1, 1] = s[:, 0] ** 2, s[:, 1] ** 2
+        ids = range(len(x_D)) if pose_id is None else pose_id
+        return cls(x_D=x_D, covariance=covariance, pose_id=tuple(str(i) for i in ids), **columns)
+
+    def __len__(self) -> int:
+        return len(self.pose_id)
+
+    @property
+    def sigma(self) -> Array:
+        """(n, 2) standard uncertainties of u and v, px."""
+        return np.sqrt(np.einsum("nii->ni", self.covariance))
+
+    def select(self, index: Any) -> BallObservations:
+        """The rows with those indices (or that mask), in that order."""
+        i = np.arange(len(self))[np.asarray(index)]
+
+        def of(column: Any) -> Any:
+            return None if column is None else column[i]
+
+        return replace(
+            self,
+            x_D=self.x_D[i],
+            covariance=self.covariance[i],
+            pose_id=tuple(self.pose_id[k] for k in i),
+            seen=self.seen[i],
+            status=tuple(self.status[k] for k in i) if self.status is not None else None,
+            image=None if self.image is None else tuple(self.image[k] for k in i),
+            **{name: of(getattr(self, name)) for name in (*OPTIONAL_COLUMNS, "x_ellipse")},
+        )
+
+    @property
+    def used(self) -> BallObservations:
+        """Only the rows that are seen."""
+        return self.select(self.seen)
