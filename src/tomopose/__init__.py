@@ -20,7 +20,7 @@ _HOME = {
     "TomoposeError": "tomopose.errors",
 }
 
-__all__ = sorted(_HOME)
+__all__ = [*sorted(_HOME)]
 
 
 def __getattr__(name: str) -> Any:

@@ -19,7 +19,7 @@ PANEL_TOLERANCE = 1e-7
 
 
 def project(P: Any, x: Any) -> Array:
-    """Pixels (..., m, 2) of points x (m, 3), mm, under matrices P (..., 3, 4).  Points with w <= 0 give NaN.  Eq. (2)."""
+    """Pixels (..., m, 2) of points x (m, 3), mm, under matrices P (..., 3, 4).  Eq. (2).  NaN where w <= 0."""
     P, x = np.asarray(P, dtype=np.float64), np.asarray(x, dtype=np.float64)
     h = np.einsum("...ij,mj->...mi", P[..., :3], x) + P[..., None, :, 3]
     w = h[..., 2:]
@@ -256,4 +256,4 @@ class ProjectionMatrices:
         """OutOfViewError, naming the views, where points (m, 3) of W lie behind the source."""
         bad = np.flatnonzero(np.isnan(self.project(x_W)).any(axis=(1, 2)))
         if bad.size:
-            raise OutOfViewError(f"{bad.size} views have points behind the source, first view {bad[0]}", indices=bad)
+            raise OutOfViewError(f"{bad.size} views have points behind the source, first view {bad[0]}", indices=bad.tolist())

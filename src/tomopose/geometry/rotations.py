@@ -6,6 +6,7 @@ files; inside, rotations are matrices, and two of them are compared by their log
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
@@ -163,7 +164,8 @@ def rotation_from_convention(values: Array, convention: str) -> Array:
     c = convention_named(convention)
     values = np.asarray(values, dtype=np.float64)
     if values.ndim != 2 or values.shape[1] != len(c.columns):
-        raise ShapeError(f"convention {c.name} has columns {', '.join(c.columns)}; got an array of shape {values.shape}")
+        columns = ", ".join(c.columns)
+        raise ShapeError(f"convention {c.name} has columns {columns}; got an array of shape {values.shape}")
     if c.kind == "quaternion":
         norm = np.linalg.norm(values, axis=1)
         bad = np.flatnonzero(np.abs(norm - 1) > QUATERNION_NORM_TOLERANCE)
@@ -189,4 +191,6 @@ def convention_from_rotation(R: Array, convention: str) -> Array:
         return rotation.as_quat(canonical=True, scalar_first=c.scalar_first)
     if c.kind == "rotvec":
         return rotation.as_rotvec()
-    return rotation.as_euler(c.axes, degrees=c.unit == "deg", suppress_warnings=True)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Gimbal lock")  # the angles chosen there still give R
+        return rotation.as_euler(c.axes, degrees=c.unit == "deg")  # type: ignore[arg-type]

@@ -153,13 +153,16 @@ class Scanner:
     @property
     def T_WS(self) -> RigidTransform:
         """World to source.  Eq. (4)."""
-        return RigidTransform(R=R_WS, t=[0.0, 0.0, self.d_SR], source=Frame.W, target=Frame.S)
+        return RigidTransform(R=R_WS, t=np.array([0.0, 0.0, self.d_SR]), source=Frame.W, target=Frame.S)
 
     @property
     def table_axis(self) -> RigidTransform:
         """A map of W onto itself that takes the z axis to the real table axis; the identity for the paper's setup."""
         return RigidTransform(
-            R=R_x(self.axis_tilt_x) @ R_y(self.axis_tilt_y), t=[0.0, self.axis_y, 0.0], source=Frame.W, target=Frame.W
+            R=R_x(self.axis_tilt_x) @ R_y(self.axis_tilt_y),
+            t=np.array([0.0, self.axis_y, 0.0]),
+            source=Frame.W,
+            target=Frame.W,
         )
 
     def T_TW(self, alpha: Array | float) -> RigidTransform:
