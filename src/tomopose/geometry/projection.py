@@ -256,4 +256,6 @@ class ProjectionMatrices:
         """OutOfViewError, naming the views, where points (m, 3) of W lie behind the source."""
         bad = np.flatnonzero(np.isnan(self.project(x_W)).any(axis=(1, 2)))
         if bad.size:
-            raise OutOfViewError(f"{bad.size} views have points behind the source, first view {bad[0]}", indices=bad.tolist())
+            raise OutOfViewError(
+                f"{bad.size} views have points behind the source, first view {bad[0]}", indices=bad.tolist()
+            )

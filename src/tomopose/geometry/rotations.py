@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -193,4 +193,4 @@ def convention_from_rotation(R: Array, convention: str) -> Array:
         return rotation.as_rotvec()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Gimbal lock")  # the angles chosen there still give R
-        return rotation.as_euler(c.axes, degrees=c.unit == "deg")  # type: ignore[arg-type]
+        return rotation.as_euler(cast(Any, c.axes), degrees=c.unit == "deg")
