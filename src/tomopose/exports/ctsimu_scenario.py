@@ -1,0 +1,256 @@
+"""CTSimU scenarios 1.0 to 1.2, read: where source, panel and stage stand in every frame, as a reconstruction knows it.
+
+Per frame and part: the standard pose, the stage's turn about w between start and stop angle, the deviations in their
+order (about world axes x, y, z or the part's own axes u, v, w as they then stand), and at last the drift of the centre.
+Only what is `known_to_reconstruction` counts.  A list of drift values is stretched over the scan and interpolated
+linearly.  W is the stage turned by 180 degrees about its w axis.  Source: CTSimU scenario file format 1.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tomopose.errors import InputError, SchemaVersionError, UnitError
+from tomopose.exports.panel import Given, matrices_of_panels, numbers
+from tomopose.geometry.projection import ProjectionMatrices
+from tomopose.geometry.rotations import R_z, exp_rotation
+from tomopose.units import Array, float_array
+
+NEWEST = (1, 2)
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "mm": {"nm": 1e-6, "um": 1e-3, "mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0},
+    "rad": {"rad": 1.0, "deg": np.pi / 180},
+    "": {"": 1.0},
+}
+REMARKS = ("comment", "comments", "description", "name", "type", "uncertainty", "uncertainty_unit")
+
+
+def from_ctsimu(content: Mapping[str, Any], given: Given, *, where: str = "the CTSimU scenario") -> ProjectionMatrices:
+    """Matrices of a scenario's JSON content.  v counts upwards in them, whatever the order of the image files.
+
+    Raises InputError, with the place in the file, where it says something that is not read: parts attached to the
+    stage, drifts of direction vectors, drifts kept in other files, pixel binning, deviations of formats before 1.0.
+    """
+    _check_version(content, where)
+    acquisition = _section(content, "acquisition", where)
+    n = acquisition.get("number_of_projections")
+    n = n.get("value") if isinstance(n, Mapping) else n
+    if isinstance(n, bool) or not isinstance(n, int) or n < 1:
+        raise InputError(f"{where}: acquisition.number_of_projections is {n!r}; a positive whole number is needed")
+    for axis, factor in (acquisition.get("pixel_binning") or {}).items():
+        if (factor.get("value") if isinstance(factor, Mapping) else factor) not in (None, 1):
+            raise InputError(f"{where}: acquisition.pixel_binning.{axis} is {factor!r}; only unbinned scans are read")
+    geometry, detector = _section(content, "geometry", where), _section(content, "detector", where)
+    parts = {
+        name: _part(_section(geometry, name, f"{where}: geometry"), n, f"{where}: geometry.{name}", turn)
+        for name, turn in (("source", None), ("detector", None), ("stage", stage_angles(acquisition, n, where)))
+    }
+    pitch = _section(detector, "pixel_pitch", f"{where}: detector")
+    p_u, p_v = (_constant(pitch, k, n, "mm", f"{where}: detector.pixel_pitch") for k in "uv")
+    n_u, n_v = (_constant(detector, k, n, "", f"{where}: detector") for k in ("columns", "rows"))
+    settled = Given(
+        n_u=given.settle("n_u", int(n_u), where),
+        n_v=given.settle("n_v", int(n_v), where),
+        p_u=given.settle("p_u", p_u, where),
+        p_v=given.settle("p_v", p_v, where),
+        pose_id=given.pose_id,
+    )
+    stage, panel = parts["stage"], parts["detector"]
+    R_W = np.stack([-stage.axes[:, :, 0], -stage.axes[:, :, 1], stage.axes[:, :, 2]], axis=1)
+
+    def to_W(x: Array) -> Array:
+        return (R_W @ x[..., None])[..., 0]
+
+    return matrices_of_panels(
+        to_W(parts["source"].centre - stage.centre),
+        to_W(panel.centre - stage.centre),
+        p_u * to_W(panel.axes[:, :, 0]),
+        -p_v * to_W(panel.axes[:, :, 1]),
+        given=settled,
+        rows="bottom",
+        where=where,
+    )
+
+
+def stage_angles(acquisition: Mapping[str, Any], n: int, where: str) -> Array:
+    """(n,), rad: the stage's turn about w, evenly from start to stop; positive for direction CCW."""
+    start, stop = (_constant(acquisition, k, n, "rad", f"{where}: acquisition") for k in ("start_angle", "stop_angle"))
+    direction, final = acquisition.get("direction", "CCW"), acquisition.get("include_final_angle")
+    if direction not in ("CCW", "CW"):
+        raise InputError(f"{where}: acquisition.direction is {direction!r}; 'CCW' or 'CW' is needed")
+    if stop < start:
+        raise InputError(f"{where}: acquisition.stop_angle lies before start_angle; the sense stands in 'direction'")
+    if stop > start and not isinstance(final, bool):
+        raise InputError(f"{where}: acquisition.include_final_angle is {final!r}; true or false is needed")
+    steps = n - 1 if final else n
+    angle = float_array(start + np.arange(n) * ((stop - start) / steps if steps else 0.0))
+    return -angle if direction == "CW" else angle
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pose:
+    """Centre (n, 3), mm, and axes (n, 3, 3) with columns u, v, w, in the scenario's world."""
+
+    centre: Array
+    axes: Array
+
+
+def _part(geo: Mapping[str, Any], n: int, where: str, turn: Array | None) -> _Pose:
+    _known(geo, ("center", "centre", "vector_u", "vector_w", "deviations"), where)
+    centre_json = _section(geo, "centre" if "centre" in geo else "center", where)
+    if not all(k in centre_json for k in "xyz"):
+        raise InputError(f"{where}.center has no x, y, z; parts attached to the stage are not read")
+    base, drift = _vector(centre_json, "xyz", n, "mm", f"{where}.center")
+    directions = []
+    for name in ("vector_u", "vector_w"):
+        vector, moved = _vector(_section(geo, name, where), "xyz", n, "", f"{where}.{name}")
+        if moved.any():
+            raise InputError(f"{where}.{name} drifts; its meaning beside deviations is not settled, it is not read")
+        if not np.linalg.norm(vector) > 0:
+            raise InputError(f"{where}.{name} has length 0")
+        directions.append(vector / np.linalg.norm(vector))
+    u, w = directions
+    if abs(u @ w) > 1e-6:
+        raise InputError(f"{where}: vector_u and vector_w are not at right angles (cosine {u @ w:.3g})")
+    v = np.cross(w, u)
+    axes = np.repeat(np.stack([u, v, w], axis=-1)[None], n, axis=0)
+    if turn is not None:
+        axes = axes @ R_z(turn)
+    pose = _Pose(centre=np.repeat(base[None], n, axis=0), axes=axes)
+    deviations = geo.get("deviations") or []
+    for k, deviation in enumerate([deviations] if isinstance(deviations, Mapping) else deviations):
+        pose = _deviate(pose, deviation, n, f"{where}.deviations[{k}]")
+    return _Pose(centre=pose.centre + drift, axes=pose.axes)
+
+
+def _deviate(pose: _Pose, deviation: Mapping[str, Any], n: int, where: str) -> _Pose:
+    """The pose after one deviation: a shift along, or a turn about, an axis of the world or of the part itself."""
+    _known(deviation, ("type", "axis", "pivot", "amount", "known_to_reconstruction"), where)
+    if not _is_known(deviation, where):
+        return pose
+    kind = deviation.get("type")
+    if kind not in ("rotation", "translation"):
+        raise InputError(f"{where}.type is {kind!r}; 'rotation' or 'translation' is needed")
+    if "amount" not in deviation:
+        raise InputError(f"{where} has no amount")
+    value, drift = _values(deviation["amount"], n, "rad" if kind == "rotation" else "mm", f"{where}.amount")
+    amount = value + drift
+    axis = deviation.get("axis")
+    if isinstance(axis, str) and len(axis) == 1 and axis in "xyzuvwrst":
+        axis = {k: float(k == axis) for k in next(s for s in ("xyz", "uvw", "rst") if axis in s)}
+    direction, local = _free_vector(axis, n, "", f"{where}.axis")
+    length = np.linalg.norm(direction, axis=1, keepdims=True)
+    if not length.min() > 0:
+        raise InputError(f"{where}.axis has length 0")
+    direction = direction / length
+    if local:
+        direction = (pose.axes @ direction[..., None])[..., 0]
+    if kind == "translation":
+        return _Pose(centre=pose.centre + amount[:, None] * direction, axes=pose.axes)
+    pivot = pose.centre
+    if deviation.get("pivot") is not None:
+        pivot, local = _free_vector(deviation["pivot"], n, "mm", f"{where}.pivot")
+        if local:
+            pivot = pose.centre + (pose.axes @ pivot[..., None])[..., 0]
+    R = exp_rotation(amount[:, None] * direction)
+    return _Pose(centre=pivot + (R @ (pose.centre - pivot)[..., None])[..., 0], axes=R @ pose.axes)
+
+
+def _free_vector(json: Any, n: int, kind: str, where: str) -> tuple[Array, bool]:
+    """(n, 3) and whether it is written in the part's own axes (u, v, w, or r, s, t) rather than the world's."""
+    for names in ("xyz", "uvw", "rst"):
+        if isinstance(json, Mapping) and all(k in json for k in names):
+            base, drift = _vector(json, names, n, kind, where)
+            return base + drift, names != "xyz"
+    raise InputError(f"{where} is {json!r}; x, y, z or u, v, w components are needed")
+
+
+def _vector(json: Mapping[str, Any], names: str, n: int, kind: str, where: str) -> tuple[Array, Array]:
+    """The standard vector (3,) and its drift (n, 3)."""
+    _known(json, tuple(names), where)
+    missing = [k for k in names if k not in json]
+    if missing:
+        raise InputError(f"{where} lacks {', '.join(missing)}")
+    values = [_values(json[k], n, kind, f"{where}.{k}") for k in names]
+    return np.array([value for value, _ in values]), np.stack([drift for _, drift in values], axis=-1)
+
+
+def _values(json: Any, n: int, kind: str, where: str) -> tuple[float, Array]:
+    """A parameter's standard value and the sum of its drifts (n,), in mm, rad or without unit."""
+    if not isinstance(json, Mapping):
+        json = {"value": json}
+    _known(json, ("value", "unit", "drifts"), where)
+    value = float(numbers(json.get("value"), (), where)) * _unit(json, kind, where, zero=json.get("value") == 0)
+    total = np.zeros(n)
+    drifts = json.get("drifts") or []
+    for k, drift in enumerate([drifts] if isinstance(drifts, Mapping) else drifts):
+        place = f"{where}.drifts[{k}]"
+        _known(drift, ("value", "unit", "known_to_reconstruction", "file"), place)
+        if not _is_known(drift, place):
+            continue
+        if drift.get("value") is None:
+            raise InputError(f"{place} keeps its values in the file {drift.get('file')!r}; put them into 'value'")
+        steps = np.atleast_1d(np.asarray(drift["value"]))
+        steps = numbers(steps, (-1,), place) * _unit({"unit": json.get("unit"), **drift}, kind, place, zero=False)
+        if not len(steps):
+            raise InputError(f"{place} has no values")
+        # One scan long, whatever the number of values; a scan of one frame takes the first.
+        at = np.arange(n) if len(steps) == n else np.linspace(0, len(steps) - 1, n)
+        total += np.interp(at, np.arange(len(steps)), steps)
+    return value, total
+
+
+def _constant(json: Mapping[str, Any], name: str, n: int, kind: str, where: str) -> float:
+    if json.get(name) is None:
+        raise InputError(f"{where}.{name} is missing")
+    value, drift = _values(json[name], n, kind, f"{where}.{name}")
+    if drift.any():
+        raise InputError(f"{where}.{name} drifts; one value for the whole scan is needed")
+    return value
+
+
+def _unit(json: Mapping[str, Any], kind: str, where: str, *, zero: bool) -> float:
+    unit = json.get("unit") or ""
+    if kind and not unit and zero:
+        return 1.0
+    if unit not in UNITS[kind]:
+        known = ", ".join(u for u in UNITS[kind] if u) or "no unit"
+        raise UnitError(f"{where}: unit is {unit or 'missing'!r}; needed is one of: {known}")
+    return UNITS[kind][unit]
+
+
+def _is_known(json: Mapping[str, Any], where: str) -> bool:
+    known = json.get("known_to_reconstruction")
+    if known not in (None, True, False):
+        raise InputError(f"{where}.known_to_reconstruction is {known!r}; true or false is needed")
+    return known is not False
+
+
+def _known(json: Any, keys: Sequence[str], where: str) -> None:
+    """InputError names a key that is not read: a misspelt drift must not vanish."""
+    if not isinstance(json, Mapping):
+        raise InputError(f"{where} is {json!r}; an object is needed")
+    unknown = [k for k in json if k not in keys and k not in REMARKS]
+    if unknown:
+        raise InputError(f"{where}: {unknown[0]!r} is not read here; known are {', '.join(keys)}")
+
+
+def _section(json: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
+    part = json.get(name)
+    if not isinstance(part, Mapping):
+        raise InputError(f"{where} lacks the section {name!r}")
+    return part
+
+
+def _check_version(content: Mapping[str, Any], where: str) -> None:
+    file = _section(content, "file", where)
+    if file.get("file_type") != "CTSimU Scenario":
+        raise InputError(f"{where}: file.file_type is {file.get('file_type')!r}, not 'CTSimU Scenario'")
+    version = file.get("file_format_version") or {}
+    found = (version.get("major"), version.get("minor"))
+    if not all(isinstance(x, int) for x in found) or not (1, 0) <= found <= NEWEST:
+        raise SchemaVersionError(f"{where}: file format {found[0]}.{found[1]}; 1.0 to 1.2 are read")
