@@ -1,13 +1,14 @@
 r"""Maximum a posteriori estimate of mount, balls, scanner and manipulator errors together.
 
-For pose k the model predicts x_D,k(theta), theta = (T_HT, t of each ball, freed scanner parameters, manipulator errors p).
-Minimised is
+For pose k the model predicts x_D,k(theta) with theta = (T_HT, t of each ball, freed scanner parameters, manipulator
+errors p).  Minimised is
 
     sum_k r_k^T C_k^-1 r_k  +  sum_i p_i^2 / sigma_i^2  +  sum_bars (|t_a - t_b| - L)^2 / u_L^2
 
 with C_k the covariance of the observation plus that of the plate's scatter seen through the projection,
-C_k = C_obs,k + f J_pose diag(repeatability) J_pose^T.  The priors sigma_i make the problem well posed: shifts and turns of
-all base joints (or all platform joints) together cannot be told from T_HT (or t), and stay where the prior puts them.
+C_k = C_obs,k + f J_pose diag(repeatability) J_pose^T.  The priors sigma_i make the problem well posed: shifts and
+turns of all base joints (or all platform joints) together cannot be told from T_HT (or t), and stay where the prior
+puts them.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.manipulator.error_models import ErrorModel
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.manipulator.real_poses import ErrorModel
 from tomopose.units import Array
 
 STEPS = 40
@@ -36,7 +37,7 @@ LEAST_DAMPING, LARGEST_DAMPING = 1e-6, 1e8
 
 
 @dataclass(frozen=True, kw_only=True)
-class Problem:
+class KinematicProblem:
     """What was measured, and what may be wrong.  Rows of poses, x_D and covariance belong together.
 
     x_D (n, 2) px, covariance (n, 2, 2) px^2: observed ball centres.
@@ -77,7 +78,7 @@ class Problem:
         errors = np.zeros(0) if self.model is None else self.model.sigma
         return np.concatenate([flat, list(self.free.values()), errors])
 
-    def rows(self, index: Array) -> Problem:
+    def rows(self, index: Array) -> KinematicProblem:
         """The same problem with those rows only."""
         return replace(
             self, poses=self.poses.select(index), x_D=self.x_D[index], covariance=self.covariance[index]
@@ -123,7 +124,7 @@ class MapEstimate:
     """The optimum: state, linearisation there, covariance (m, m), chi2 with priors, dof = equations - free parameters
     without a prior, log_evidence (Laplace; comparable between models of the same observations)."""
 
-    problem: Problem
+    problem: KinematicProblem
     state: State
     at: Linearised
     covariance: Array
@@ -135,7 +136,7 @@ class MapEstimate:
     steps: int
 
 
-def linearise(problem: Problem, state: State) -> Linearised:
+def linearise(problem: KinematicProblem, state: State) -> Linearised:
     """The prediction and its derivatives at theta."""
     poses = problem.poses
     row_of = {ball: k for k, ball in enumerate(problem.ball_ids)}
@@ -144,8 +145,7 @@ def linearise(problem: Problem, state: State) -> Linearised:
     T_MH, J_errors = poses.T_MH, np.zeros((n, 6, 0))
     if problem.model is not None:
         real = problem.model.real_poses(poses, state.p)
-        T_MH = RigidTransform(R=real.R, t=real.t, source=Frame.M, target=Frame.H)
-        J_errors = real.J
+        T_MH, J_errors = real.T_MH, real.J
     blocks = projection_blocks(
         state.scanner, T_HT=state.T_HT, T_MH=T_MH, t=state.balls[ball_row], alpha=poses.alpha
     )
@@ -168,7 +168,7 @@ def linearise(problem: Problem, state: State) -> Linearised:
     return Linearised(r=problem.x_D - blocks.x_D, J=J, C=C, J_pose=J_pose)
 
 
-def _bar_rows(problem: Problem, state: State) -> tuple[Array, Array]:
+def _bar_rows(problem: KinematicProblem, state: State) -> tuple[Array, Array]:
     """Weighted residuals (nbar,) and rows (nbar, m) of the known distances between balls."""
     ids = problem.ball_ids
     rows, m = [], len(problem.tangent)
@@ -184,7 +184,9 @@ def _bar_rows(problem: Problem, state: State) -> tuple[Array, Array]:
     return np.array(r), np.reshape(rows, (len(r), m))
 
 
-def _weighted(problem: Problem, state: State, W: Array | None = None) -> tuple[Array, Array, Linearised, Array]:
+def _weighted(
+    problem: KinematicProblem, state: State, W: Array | None = None
+) -> tuple[Array, Array, Linearised, Array]:
     """All residuals and rows in standard deviations: observations, bars, priors; the linearisation; whiteners.
 
     W (n, 2, 2): whiteners to use; None: those of this state.
@@ -211,7 +213,7 @@ def _svd(J: Array) -> tuple[Array, Array, Array, Array]:
     return U, s, Vt, scale
 
 
-def solve_map(problem: Problem, start: State) -> MapEstimate:
+def solve_map(problem: KinematicProblem, start: State) -> MapEstimate:
     """Levenberg-Marquardt from `start`, the weights renewed at every step.
 
     Raises NotConvergedError where no optimum is reached.
@@ -240,7 +242,7 @@ def solve_map(problem: Problem, start: State) -> MapEstimate:
     raise NotConvergedError(f"no optimum after {STEPS} steps; the last one still gained {drop:.3g} in chi2")
 
 
-def _estimate(problem: Problem, state: State, r: Array, J: Array, at: Linearised, steps: int) -> MapEstimate:
+def _estimate(problem: KinematicProblem, state: State, r: Array, J: Array, at: Linearised, steps: int) -> MapEstimate:
     _, s, Vt, scale = _svd(J)
     inverse = np.where(s > s[0] * RANK_TOLERANCE, 1 / np.maximum(s, 1e-300), np.inf)
     half = np.where(np.isfinite(inverse), inverse, 0.0)[:, None] * Vt / scale
@@ -266,7 +268,7 @@ def _estimate(problem: Problem, state: State, r: Array, J: Array, at: Linearised
     )
 
 
-def parameter_units(problem: Problem) -> tuple[str, ...]:
+def parameter_units(problem: KinematicProblem) -> tuple[str, ...]:
     """The unit of each coordinate of theta."""
     return (
         *("rad",) * 3, *("mm",) * 3, *("mm",) * (3 * len(problem.ball_ids)),

@@ -1,92 +1,169 @@
-"""What every error model of a manipulator can do: from the controller's pose to the pose of the real plate.
+"""Identified errors at work: where the real plate stands for any pose table, and what to command instead.
 
-A model holds the nominal machine and the standard deviations of its errors; the errors themselves are a vector
-p (m,), zero for a perfect machine, so that identified errors are data and no model ever changes.
+`Calibration.manipulator` (and calibration.json) hold a machine with the errors that were found:
+
+    {"kind": "hexapod" | "serial" | "map",  "nominal": the machine as in its file,
+     "names", "values", "units", "u": of its errors,
+     "range": {"t_mm": [low (3), high (3)], "w_rad": [low, high]}: of the calibration's poses}
+
+Home of eq. (5) stays the identity: M is the frame that equals H when the controller's zero pose is executed without
+error.  The real plate at commanded zero is one of the corrected poses like any other; the difference is a rigid pose of
+the object, on which no measurement depends.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from tomopose.errors import InputError
-from tomopose.geometry.rotations import exp_rotation
+from tomopose.errors import InputError, OutOfReachError
+from tomopose.geometry.rotations import log_rotation
+from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.files import hexapod_from_document, serial_from_document
+from tomopose.manipulator.pose_map import PoseMap
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.manipulator.real_poses import ErrorModel, Repeatability, moved
+from tomopose.manipulator.serial import SerialRobot
 from tomopose.units import Array
 
-
-@dataclass(frozen=True, kw_only=True)
-class Repeatability:
-    """Scatter of the real plate about the pose that its errors give it, 1 sigma of each coordinate.
-
-    t_mm: of the plate's origin, mm; w_rad: of its rotation vector, rad.  The defaults are the limits that the maker of
-    the paper's hexapod states (sec. 2), taken as one standard deviation.
-    """
-
-    t_mm: float = 0.0005
-    w_rad: float = 12e-6
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite([self.t_mm, self.w_rad]).all() and self.t_mm >= 0 and self.w_rad >= 0):
-            raise InputError(f"repeatability is {self.t_mm!r} mm and {self.w_rad!r} rad; two numbers >= 0 are needed")
-
-    @property
-    def variance(self) -> Array:
-        """(6,): of (w, t), rad^2 and mm^2."""
-        return np.repeat([self.w_rad**2, self.t_mm**2], 3)
+RANGE_MARGIN = 0.1
+"""Of the calibrated range's width: as far outside a pose still counts as inside."""
+COMMAND_STEPS = 30
+COMMAND_TOLERANCE = 1e-9
+"""mm, and rad at 1000 mm."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RealPoses:
-    """n poses of the real plate and how they answer to the errors.
+class Correction:
+    """Corrected poses and what is known about them.
 
-    R (n, 3, 3), t (n, 3) mm: real T_MH.  J (n, 6, m): derivative of (w, t) by the errors p, where the plate turns by
-    exp(w) from the left and its origin moves by t, both in H.
+    poses:    the table with T_MH of the real plate.
+    J:        (n, 6, m) derivative of (w, t) of the real plate by the errors `names`: it turns by exp(w) from the left,
+              its origin moves by t, both in H, rad and mm.
+    outside:  (n,) bool: the pose lies outside the range in which the errors were identified.
+    notes:    sentences to show with the result.
     """
 
-    R: Array
-    t: Array
+    poses: PoseSequence
     J: Array
+    names: tuple[str, ...]
+    outside: Any
+    notes: tuple[str, ...] = ()
 
 
-class ErrorModel(Protocol):
-    """kind: "hexapod", "serial", "map"; names, units, sigma (m,): of the errors; repeatability: of the plate."""
-
-    @property
-    def kind(self) -> str: ...
-    @property
-    def names(self) -> tuple[str, ...]: ...
-    @property
-    def units(self) -> tuple[str, ...]: ...
-    @property
-    def sigma(self) -> Array: ...
-    @property
-    def repeatability(self) -> Repeatability: ...
-
-    def real_poses(self, poses: PoseSequence, p: Array) -> RealPoses:
-        """Where the real plate stands when the controller is told `poses` and the machine has the errors p."""
-        ...
-
-    def to_json(self) -> dict[str, Any]: ...
+def manipulator_block(model: ErrorModel, p: Array, u: Array, poses: PoseSequence) -> dict[str, Any]:
+    """The block above for errors p (m,) with standard uncertainties u, found with `poses`."""
+    w = log_rotation(poses.T_MH.R)
+    t = poses.T_MH.t
+    return {
+        "kind": model.kind,
+        "nominal": model.to_json(),
+        "names": list(model.names),
+        "values": np.asarray(p).tolist(),
+        "units": list(model.units),
+        "u": np.asarray(u).tolist(),
+        "range": {
+            "t_mm": [t.min(axis=0).tolist(), t.max(axis=0).tolist()],
+            "w_rad": [w.min(axis=0).tolist(), w.max(axis=0).tolist()],
+        },
+    }
 
 
-def left_jacobian(w: Array) -> Array:
-    """J_l (..., 3, 3) of SO(3): exp(w + dw) = exp(J_l dw) exp(w) to first order."""
-    w = np.asarray(w, dtype=np.float64)
-    theta2 = np.sum(w * w, axis=-1)[..., None, None]
-    theta = np.sqrt(theta2)
-    small = theta < 1e-4
-    safe = np.where(small, 1.0, theta)
-    a = np.where(small, 0.5 - theta2 / 24, (1 - np.cos(safe)) / safe**2)
-    b = np.where(small, 1 / 6 - theta2 / 120, (safe - np.sin(safe)) / safe**3)
-    W = np.zeros((*w.shape[:-1], 3, 3))
-    W[..., 0, 1], W[..., 0, 2], W[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
-    W -= np.swapaxes(W, -1, -2)
-    return np.eye(3) + a * W + b * (W @ W)
+def model_from_block(manipulator: Mapping[str, Any]) -> tuple[ErrorModel, Array]:
+    """The machine and its errors p (m,) from a calibration's block; InputError where the block is damaged."""
+    kind, where = manipulator.get("kind"), "calibration: manipulator"
+    try:
+        nominal, values = manipulator["nominal"], np.array(manipulator["values"], dtype=np.float64)
+        model: ErrorModel
+        if kind == "hexapod":
+            model = hexapod_from_document(nominal, where)
+        elif kind == "serial":
+            model = serial_from_document(nominal, where)
+        elif kind == "map":
+            model = PoseMap(
+                order=int(nominal["order"]), t_scale=nominal["t_scale_mm"], w_scale=nominal["w_scale_rad"],
+                t_sigma=nominal["t_sigma_mm"], w_sigma=nominal["w_sigma_rad"],
+                repeatability=Repeatability(**nominal["repeatability"]),
+            )
+        else:
+            raise InputError(f"{where} has kind {kind!r}; hexapod, serial and map are known")
+    except KeyError as error:
+        raise InputError(f"{where}: the key {error} is missing") from error
+    if tuple(manipulator.get("names", ())) != model.names or values.shape != (len(model.names),):
+        raise InputError(f"{where}: names and values do not fit a {kind} with {len(model.names)} errors")
+    return model, values
 
 
-def moved(R: Array, t: Array, delta: Array) -> tuple[Array, Array]:
-    """The poses (R, t) after the small motions delta (n, 6) = (w, t) in H."""
-    return exp_rotation(delta[..., :3]) @ R, t + delta[..., 3:]
+def correction(manipulator: Mapping[str, Any], poses: PoseSequence) -> Correction:
+    """The table with the poses of the real plate, its Jacobian and what lies outside the calibrated range.
+
+    An empty block (a rigid calibration) leaves the poses as they are.
+    """
+    n = len(poses)
+    if not manipulator:
+        return Correction(poses=poses, J=np.zeros((n, 6, 0)), names=(), outside=np.zeros(n, dtype=bool))
+    model, p = model_from_block(manipulator)
+    real = model.real_poses(poses, p)
+    outside = _outside(manipulator["range"], poses)
+    notes: tuple[str, ...] = ()
+    if outside.any():
+        first = int(np.flatnonzero(outside)[0])
+        notes = (
+            f"{int(outside.sum())} of {n} poses lie outside the range in which the manipulator's errors were "
+            f"identified, the first is {poses.pose_id[first]!r}; there the correction rests on the model alone",
+        )
+    return Correction(poses=replace(poses, T_MH=real.T_MH), J=real.J, names=model.names, outside=outside, notes=notes)
+
+
+def corrected_poses(manipulator: Mapping[str, Any], poses: PoseSequence) -> PoseSequence:
+    """The table with T_MH of the real plate in place of the controller's."""
+    return correction(manipulator, poses).poses
+
+
+def commands_for(manipulator: Mapping[str, Any], wanted: PoseSequence) -> PoseSequence:
+    """The table to command so that the real plate reaches the poses `wanted`: the inverse correction.
+
+    Joint values are returned too where `wanted` has them (they say which branch of a robot is meant).
+    Raises OutOfReachError, naming the poses, where the real machine cannot get there.
+    """
+    if not manipulator:
+        return wanted
+    model, p = model_from_block(manipulator)
+    command = replace(wanted, q=None)
+    extra = None
+    if isinstance(model, SerialRobot):
+        q, extra = model.joint_values(wanted)
+        command = replace(wanted, q=q)
+    for _ in range(COMMAND_STEPS):
+        real = model.real_poses(command, p)
+        w = log_rotation(wanted.T_MH.R @ np.swapaxes(real.R, 1, 2))
+        delta = np.concatenate([w, wanted.T_MH.t - real.t], axis=1)
+        miss = np.maximum(np.abs(delta[:, :3]).max(axis=1) * 1000.0, np.abs(delta[:, 3:]).max(axis=1))
+        if miss.max() < COMMAND_TOLERANCE:
+            return command if wanted.q is not None else replace(command, q=None)
+        R, t = moved(command.T_MH.R, command.T_MH.t, delta)
+        T_MH = RigidTransform(R=R, t=t, source=command.T_MH.source, target=command.T_MH.target)
+        if isinstance(model, SerialRobot) and extra is not None:
+            T_flange = RigidTransform.from_matrix(
+                T_MH.matrix @ np.linalg.inv(extra), source=T_MH.source, target=T_MH.target
+            )
+            command = replace(command, T_MH=T_MH, q=model.inverse(T_flange, q_start=command.q))
+        else:
+            command = replace(command, T_MH=T_MH)
+    bad = np.flatnonzero(miss >= COMMAND_TOLERANCE)
+    raise OutOfReachError(
+        f"{bad.size} wanted poses cannot be commanded: pose {wanted.pose_id[int(bad[0])]!r} is missed by "
+        f"{miss[bad[0]]:.3g} mm",
+        indices=bad.tolist(),
+    )
+
+
+def _outside(limits: Mapping[str, Any], poses: PoseSequence) -> Any:
+    x = np.concatenate([poses.T_MH.t, log_rotation(poses.T_MH.R)], axis=1)
+    low = np.concatenate([limits["t_mm"][0], limits["w_rad"][0]])
+    high = np.concatenate([limits["t_mm"][1], limits["w_rad"][1]])
+    margin = RANGE_MARGIN * (high - low) + np.repeat([1e-3, 1e-6], 3)
+    return ((x < low - margin) | (x > high + margin)).any(axis=1)

@@ -29,8 +29,8 @@ import numpy as np
 
 from tomopose.errors import InputError, OutOfReachError, ShapeError, TrajectoryError
 from tomopose.geometry.rotations import exp_rotation, skew
-from tomopose.manipulator.error_models import RealPoses, Repeatability, left_jacobian, moved
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.manipulator.real_poses import RealPoses, Repeatability, left_jacobian, moved
 from tomopose.units import Array, float_array
 
 NEWTON_STEPS = 30
@@ -162,7 +162,8 @@ class Hexapod:
         return RealPoses(R=R, t=t, J=self._jacobian(part, R, A, legs, A_nominal, J_command))
 
     def _jacobian(
-        self, part: Mapping[str, tuple[slice, Array]], R: Array, A: Array, legs: Array, A_nominal: Array, J_command: Array
+        self, part: Mapping[str, tuple[slice, Array]], R: Array, A: Array, legs: Array, A_nominal: Array,
+        J_command: Array,
     ) -> Array:
         """d(w, t) / dp (n, 6, m) = A^-1 dlegs / dp."""
         normal = A[:, :, 3:]
@@ -181,7 +182,8 @@ class Hexapod:
             rhs[:, :, part["leg_offset"][0]] += np.eye(6)
         if "leg_scale" in part:
             rhs[:, :, part["leg_scale"][0]] += legs[:, :, None] * np.eye(6)
-        return np.linalg.solve(A, rhs)
+        J: Array = np.linalg.solve(A, rhs)
+        return J
 
     def _require_limits(self, legs: Array) -> None:
         if self.leg_limits is None:
@@ -207,7 +209,7 @@ class Hexapod:
             "axes_sigma_rad": self.axes_sigma,
             "pivot_sigma_mm": self.pivot_sigma,
             **({} if self.leg_limits is None else {"leg_limits_mm": list(self.leg_limits)}),
-            "repeatability": {"t_mm": self.repeatability.t_mm, "w_rad": self.repeatability.w_rad},
+            "repeatability": self.repeatability.to_json(),
         }
 
 
@@ -224,9 +226,9 @@ def _forward(b: Array, p: Array, legs: Array, R: Array, t: Array) -> tuple[Array
     """Poses (R, t) whose legs have these lengths, by Newton's method, and A there."""
     radius = float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
     scaling = np.repeat([1 / radius, 1.0], 3)
-    for step in range(NEWTON_STEPS):
+    for count in range(NEWTON_STEPS):
         length, A = _legs(b, p, R, t)
-        singular_values = np.linalg.svd(A * scaling, compute_uv=False) if step == 0 else None
+        singular_values = np.linalg.svd(A * scaling, compute_uv=False) if count == 0 else None
         if singular_values is not None:
             condition = singular_values[:, 0] / np.maximum(singular_values[:, -1], 1e-300)
             bad = np.flatnonzero(~(condition < SINGULAR_CONDITION))
@@ -240,7 +242,8 @@ def _forward(b: Array, p: Array, legs: Array, R: Array, t: Array) -> tuple[Array
         error = legs - length
         if np.abs(error).max() < NEWTON_TOLERANCE:
             return R, t, A
-        R, t = moved(R, t, np.linalg.solve(A, error[..., None])[..., 0])
+        step: Array = np.linalg.solve(A, error[..., None])[..., 0]
+        R, t = moved(R, t, step)
     bad = np.flatnonzero(np.abs(error).max(axis=1) >= NEWTON_TOLERANCE)
     raise OutOfReachError(
         f"{bad.size} poses cannot be reached: no plate pose has these legs; pose {bad[0]} is left with "

@@ -1,0 +1,94 @@
+r"""A smooth map of pose errors for manipulators whose kinematics nobody knows.
+
+The real plate stands off its commanded pose (R, t) by a turn w and a shift s in H that are polynomials of low order in
+the six pose coordinates x = (t / t_scale, log R / w_scale):
+
+    (w, s) = sum_j c_j phi_j(x),   phi = x_i (order 1), and x_i x_j (order 2).
+
+A constant belongs to T_HT and is left out.  Every coefficient has the prior standard deviation w_sigma or t_sigma over
+the root of the number of terms, so that the map as a whole has about that size at the edge of the calibrated range.
+
+One ball sees a turn w of the plate only as the shift w x R t of its centre, which a shift s imitates: without
+kinematics the turns are not determined by one ball, and this model says so by its covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import combinations_with_replacement
+from typing import Any
+
+import numpy as np
+
+from tomopose.errors import InputError, ShapeError
+from tomopose.geometry.rotations import log_rotation
+from tomopose.manipulator.poses import PoseSequence
+from tomopose.manipulator.real_poses import RealPoses, Repeatability, left_jacobian, moved
+from tomopose.units import Array
+
+COORDINATES = ("x", "y", "z", "wx", "wy", "wz")
+OUTPUTS = ("w_x", "w_y", "w_z", "t_x", "t_y", "t_z")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseMap:
+    """order: 1 or 2.  t_scale (mm), w_scale (rad): half the calibrated range.  t_sigma (mm), w_sigma (rad): size of
+    the errors expected."""
+
+    order: int = 2
+    t_scale: float = 10.0
+    w_scale: float = float(np.radians(5.0))
+    t_sigma: float = 0.1
+    w_sigma: float = 1e-3
+    repeatability: Repeatability = field(default_factory=Repeatability)
+
+    kind = "map"
+
+    def __post_init__(self) -> None:
+        if self.order not in (1, 2):
+            raise InputError(f"a pose-error map of order {self.order!r} is not offered; 1 and 2 are")
+        for name in ("t_scale", "w_scale", "t_sigma", "w_sigma"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InputError(f"pose map: {name} is {getattr(self, name)}; a positive number is needed")
+
+    @property
+    def _terms(self) -> tuple[tuple[int, ...], ...]:
+        return tuple(t for k in range(1, self.order + 1) for t in combinations_with_replacement(range(6), k))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        terms = ["*".join(COORDINATES[i] for i in term) for term in self._terms]
+        return tuple(f"map_{out}[{term}]" for term in terms for out in OUTPUTS)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return ("rad", "rad", "rad", "mm", "mm", "mm") * len(self._terms)
+
+    @property
+    def sigma(self) -> Array:
+        one = np.repeat([self.w_sigma, self.t_sigma], 3) / np.sqrt(len(self._terms))
+        return np.tile(one, len(self._terms))
+
+    def features(self, poses: PoseSequence) -> Array:
+        """phi (n, terms)."""
+        x = np.concatenate([poses.T_MH.t / self.t_scale, log_rotation(poses.T_MH.R) / self.w_scale], axis=1)
+        return np.stack([np.prod(x[:, list(term)], axis=1) for term in self._terms], axis=1)
+
+    def real_poses(self, poses: PoseSequence, p: Array) -> RealPoses:
+        """Where the real plate stands for commanded `poses`, and its derivative by the coefficients p."""
+        p = np.asarray(p, dtype=np.float64)
+        phi = self.features(poses)
+        if p.shape != (6 * phi.shape[1],):
+            raise ShapeError(f"this map has {6 * phi.shape[1]} coefficients; got {p.shape}")
+        delta = phi @ p.reshape(-1, 6)
+        R, t = moved(poses.T_MH.R, poses.T_MH.t, delta)
+        J_out = np.zeros((len(poses), 6, 6))
+        J_out[:, :3, :3], J_out[:, 3:, 3:] = left_jacobian(delta[:, :3]), np.eye(3)
+        J = np.einsum("nj,nab->najb", phi, J_out).reshape(len(poses), 6, -1)
+        return RealPoses(R=R, t=t, J=J)
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "order": self.order, "t_scale_mm": self.t_scale, "w_scale_rad": self.w_scale,
+            "t_sigma_mm": self.t_sigma, "w_sigma_rad": self.w_sigma, "repeatability": self.repeatability.to_json(),
+        }
