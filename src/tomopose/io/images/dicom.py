@@ -1,0 +1,102 @@
+"""DICOM: portal and radiographic images, one or more frames a file, as their pixel values stand."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tomopose.errors import FileError, InputError
+from tomopose.io.images.frames import Band, Image, require_grey, require_one_kind, unreadable
+
+
+@dataclass(frozen=True, kw_only=True)
+class DicomSource:
+    """Frames of DICOM files.  See FrameSource."""
+
+    names: tuple[str, ...]
+    shape: tuple[int, int]
+    dtype: np.dtype[Any]
+    frames: tuple[tuple[Path, int], ...]
+    warnings: tuple[str, ...] = ()
+
+    def read(self, index: int, band: Band) -> Image:
+        path, k = self.frames[index]
+        r0, r1, c0, c1 = band
+        return _pixels(path)[k, r0:r1, c0:c1]
+
+
+def open_dicom(paths: list[Path], names: list[str]) -> DicomSource:
+    """The frames of DICOM files.  Values are scaled by RescaleSlope and RescaleIntercept where a file has them."""
+    frames: list[tuple[Path, int]] = []
+    frame_names: list[str] = []
+    kinds: list[tuple[str, tuple[int, int], np.dtype[Any]]] = []
+    notes: list[str] = []
+    for path, name in zip(paths, names, strict=True):
+        data = _dataset(path, pixels=False)
+        require_grey(str(path), np.dtype(np.uint16), int(data.get("SamplesPerPixel", 1)))
+        if str(data.get("LossyImageCompression", "00")) == "01":
+            raise InputError(f"{path} is compressed with loss; export it without")
+        if data.get("PhotometricInterpretation") == "MONOCHROME1" and not notes:
+            notes.append(f"{name}: the file says that low values are white (MONOCHROME1); values are used as stored")
+        count = int(data.get("NumberOfFrames", 1) or 1)
+        kinds.append((str(path), (int(data.Rows), int(data.Columns)), _dtype(data)))
+        for k in range(count):
+            frames.append((path, k))
+            frame_names.append(f"{name}[{k}]" if count > 1 else name)
+    require_one_kind(kinds)
+    return DicomSource(
+        names=tuple(frame_names), shape=kinds[0][1], dtype=kinds[0][2], frames=tuple(frames), warnings=tuple(notes)
+    )
+
+
+def _rescale(data: Any) -> tuple[float, float]:
+    return float(data.get("RescaleSlope", 1) or 1), float(data.get("RescaleIntercept", 0) or 0)
+
+
+def _dtype(data: Any) -> np.dtype[Any]:
+    if _rescale(data) != (1.0, 0.0):
+        return np.dtype(np.float32)
+    return np.dtype(f"{'i' if data.get('PixelRepresentation') else 'u'}{int(data.BitsAllocated) // 8}")
+
+
+def _dataset(path: Path, *, pixels: bool) -> Any:
+    """The data set of a file; without a file header its syntax is implicit little endian, DICOM's default."""
+    import pydicom
+    from pydicom.errors import InvalidDicomError
+    from pydicom.uid import ImplicitVRLittleEndian
+
+    try:
+        if path.stat().st_size == 0:
+            raise FileError(f"{path} is empty (0 bytes); copy it again", path=path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # identifiers that break DICOM's rules do not concern pixels
+            data = pydicom.dcmread(path, force=True, stop_before_pixels=not pixels)
+            if not data.file_meta.get("TransferSyntaxUID"):
+                data.file_meta.TransferSyntaxUID = ImplicitVRLittleEndian
+    except OSError as error:
+        raise unreadable(path, error) from error
+    except (InvalidDicomError, EOFError, ValueError, AttributeError, KeyError, NotImplementedError) as error:
+        raise FileError(f"{path} is no readable DICOM file: {error}", path=path) from error
+    missing = [k for k in ("Rows", "Columns", "BitsAllocated") if k not in data]
+    if missing:
+        raise FileError(f"{path} is no DICOM image ({', '.join(missing)} missing; truncated?)", path=path)
+    return data
+
+
+def _pixels(path: Path) -> Image:
+    """All frames of a file, [frame, row, column]."""
+    data = _dataset(path, pixels=True)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            pixels: Image = data.pixel_array
+    except Exception as error:  # pixel handlers raise errors of many kinds
+        raise FileError(f"{path} is damaged or truncated: {error}", path=path) from error
+    slope, intercept = _rescale(data)
+    if (slope, intercept) != (1.0, 0.0):
+        pixels = (pixels * slope + intercept).astype(np.float32)
+    return pixels.reshape(-1, int(data.Rows), int(data.Columns))

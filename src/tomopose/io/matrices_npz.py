@@ -1,0 +1,97 @@
+"""matrices.npz: projection matrices of a scan.  No pickled objects, so that any program and any version can read it."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tomopose.errors import FileError, InputError, SchemaVersionError
+from tomopose.files import SCHEMA, atomic_file, require_absent
+from tomopose.geometry.projection import ProjectionMatrices
+from tomopose.io.scanner_json import scanner_document, scanner_from_document
+from tomopose.io.table_text import unknown_column
+from tomopose.provenance import Provenance
+
+REQUIRED = ("P", "n_u", "n_v", "p_u", "p_v", "pose_id")
+KNOWN = ("schema", *REQUIRED, "P_points_sigma_px", "scanner", "provenance")
+
+
+def write_matrices(
+    path: str | Path, P: ProjectionMatrices, *, provenance: Provenance | None = None, force: bool = False
+) -> None:
+    """Write matrices.npz.  FileError if the file exists and `force` is not given."""
+    path = require_absent(path, force=force)
+    content: dict[str, Any] = {
+        "schema": "tomopose/matrices/1",
+        "P": P.P,
+        "n_u": np.int64(P.n_u),
+        "n_v": np.int64(P.n_v),
+        "p_u": np.float64(P.p_u),
+        "p_v": np.float64(P.p_v),
+        "pose_id": np.array(P.pose_id, dtype=np.str_),
+    }
+    if P.points_sigma is not None:
+        content["P_points_sigma_px"] = P.points_sigma
+    if P.scanner is not None:
+        content["scanner"] = json.dumps({"schema": "tomopose/scanner/1", **scanner_document(P.scanner)})
+    if provenance is not None:
+        content["provenance"] = json.dumps(provenance.to_json())
+    with atomic_file(path) as temporary, open(temporary, "wb") as stream:
+        np.savez(stream, **content)
+
+
+def read_matrices(path: str | Path) -> ProjectionMatrices:
+    """Read matrices.npz.
+
+    Raises FileError where it cannot be read, SchemaVersionError, InputError by key where a part is missing, unknown or
+    does not fit.
+    """
+    path = Path(path)
+    content = _load(path)
+    found = SCHEMA.fullmatch(str(content.get("schema", "")))
+    if not found or found["name"] != "matrices" or int(found["version"]) > 1:
+        raise SchemaVersionError(
+            f'{path}: schema is {str(content.get("schema"))!r}; this tomopose reads "tomopose/matrices/1"', path=path
+        )
+    for key in content:
+        if key not in KNOWN:
+            raise InputError(f"{path}: unknown key {key!r}{unknown_column(key, KNOWN)}")
+    missing = [key for key in REQUIRED if key not in content]
+    if missing:
+        raise InputError(f"{path}: {', '.join(missing)} missing")
+    scanner = None
+    if "scanner" in content:
+        scanner = scanner_from_document(json.loads(str(content["scanner"])), f"{path}: scanner")
+    try:
+        return ProjectionMatrices(
+            P=content["P"],
+            n_u=int(content["n_u"]),
+            n_v=int(content["n_v"]),
+            p_u=float(content["p_u"]),
+            p_v=float(content["p_v"]),
+            pose_id=tuple(content["pose_id"].tolist()),
+            points_sigma=content.get("P_points_sigma_px"),
+            scanner=scanner,
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def read_matrices_provenance(path: str | Path) -> Provenance | None:
+    """The provenance that stands in matrices.npz, or None."""
+    content = _load(Path(path))
+    return Provenance.from_json(json.loads(str(content["provenance"]))) if "provenance" in content else None
+
+
+def _load(path: Path) -> dict[str, Any]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {key: archive[key] for key in archive.files}
+    except FileNotFoundError as error:
+        raise FileError(f"{path} does not exist", path=path) from error
+    except (OSError, ValueError, AttributeError, zipfile.BadZipFile, EOFError) as error:
+        raise FileError(f"{path} is no matrices.npz: {error}", path=path) from error

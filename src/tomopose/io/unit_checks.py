@@ -1,0 +1,101 @@
+"""Magnitudes that belong to another unit.
+
+A file's column names say its units; a person may still have pasted other numbers below them.  These checks refuse what
+is far more likely a mistake than a measurement, and every one can be answered: `# units: confirmed` in the table,
+`"units": "confirmed"` in a JSON file, or `units_confirmed=True` in the call.  docs/formats/files.md tells the rules.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from tomopose.errors import UnitError
+from tomopose.units import Array
+
+SMALLEST_PLAN_DEG = 0.2
+"""Orientations that all stay below this are taken for radians: +-10 deg is 0.17 rad; +-0.1 deg calibrates nothing."""
+WHOLE_DEGREE_TOLERANCE = 0.005
+"""Degrees; four digits after the point of a number in radians."""
+LARGEST_ORIENTATION_DEG = 360.0
+ENCODER_NOISE_MM = 0.005
+"""Read-outs around a commanded zero stay below this; a plan in metres lies above."""
+SMALLEST_PLAN_MM = 0.05
+LARGEST_POSITION_MM = 5000.0
+ONE_TURN = 2 * math.pi
+
+TABLE_CURE = "if the numbers are right, say so with a line '# units: confirmed' or units_confirmed=True"
+
+
+def require_degrees(angles: Array, where: str) -> None:
+    """UnitError if orientation angles that should be degrees look like radians, or are no angles."""
+    largest = _largest(angles)
+    if largest > LARGEST_ORIENTATION_DEG:
+        raise UnitError(f"{where}: an angle of {largest:g} is no orientation in degrees; {TABLE_CURE}")
+    if 0 < largest < SMALLEST_PLAN_DEG or _whole_degrees_in_radians(angles):
+        raise UnitError(
+            f"{where}: the angles look like radians (largest {largest:g}, which is {math.degrees(largest):.4g} deg "
+            f"if it is rad), but the columns are in degrees; convert them, or {TABLE_CURE}"
+        )
+
+
+def require_table_degrees(alpha: Array, where: str) -> None:
+    """UnitError if table angles in degrees look like radians: whole degrees, or one even turn, if they were rad."""
+    largest = _largest(alpha)
+    a = np.sort(np.abs(alpha))
+    step = np.diff(a)
+    even = len(a) > 3 and bool(np.ptp(step) < 1e-3 * step.max()) and step.max() > 0
+    turn = even and min(abs(len(a) * step.mean() - ONE_TURN), abs(a[-1] - ONE_TURN)) < 1e-3 * ONE_TURN
+    if turn or _whole_degrees_in_radians(alpha):
+        raise UnitError(
+            f"{where}: the table angles look like radians (largest {largest:g}, which is {math.degrees(largest):.4g} "
+            f"deg if it is rad), but alpha_deg is in degrees; convert them, or {TABLE_CURE}"
+        )
+
+
+def require_radians(angles: Array, where: str) -> None:
+    """UnitError if rotation vectors that should be in rad look like degrees."""
+    largest = float(np.linalg.norm(angles, axis=-1).max(initial=0.0))
+    if largest > ONE_TURN * (1 + 1e-6):
+        raise UnitError(
+            f"{where}: a rotation vector of length {largest:g} is more than one turn in radians; are these degrees? "
+            f"Convert them, or {TABLE_CURE}"
+        )
+
+
+def require_millimetres(positions: Array, where: str) -> None:
+    """UnitError if positions that should be mm look like metres or micrometres.
+
+    Metres: all below 0.05 and not just encoder noise about zero (below 0.005), or all whole half-millimetres if they
+    were metres.  Micrometres: above 5000.
+    """
+    largest = _largest(positions)
+    if largest > LARGEST_POSITION_MM:
+        raise UnitError(
+            f"{where}: positions look like micrometres (largest {largest:g}, a reach of {largest / 1000:.3g} m if it "
+            f"is mm); convert them, or {TABLE_CURE}"
+        )
+    halves = positions * 2000.0
+    typed = bool(np.all(np.abs(halves - np.round(halves)) < 1e-6))
+    if ENCODER_NOISE_MM <= largest < SMALLEST_PLAN_MM or (0 < largest < ENCODER_NOISE_MM and typed):
+        raise UnitError(
+            f"{where}: positions look like metres (largest {largest:g}, which is {largest * 1000:g} mm if it is m), "
+            f"but the columns are in millimetres; convert them, or {TABLE_CURE}"
+        )
+
+
+def _largest(values: Array) -> float:
+    return float(np.abs(values).max(initial=0.0))
+
+
+def _whole_degrees_in_radians(angles: Array) -> bool:
+    """All angles are whole degrees if they are radians, and not all whole if they are degrees."""
+    a = angles[angles != 0]
+    if a.size == 0 or np.abs(a).max() > ONE_TURN + 1e-3:
+        return False
+    as_rad = np.degrees(a)
+    return bool(
+        np.all(np.abs(as_rad - np.round(as_rad)) < WHOLE_DEGREE_TOLERANCE)
+        and np.any(np.abs(a - np.round(a)) > WHOLE_DEGREE_TOLERANCE)
+    )
