@@ -151,7 +151,7 @@ def project_pose(
 
 @njit(cache=True)
 def _project_all(
-    s: Array, run: Array, R_HT: Array, t_HT: Array, R_k: Array, t_k: Array, t: Array, alpha: Array,
+    s: Array, run: Any, R_HT: Array, t_HT: Array, R_k: Array, t_k: Array, t: Array, alpha: Array,
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     n = R_k.shape[0]
     x, x_H, y_T = np.full((n, 2), np.nan), np.empty((n, 3)), np.empty((n, 3))

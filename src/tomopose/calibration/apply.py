@@ -1,0 +1,92 @@
+"""From a calibration to the projection matrices of any scan.  Eq. (5)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from tomopose.calibration.propagate import field_of_view_points, matrix_point_sigma
+from tomopose.calibration.result import Calibration
+from tomopose.errors import InputError
+from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
+from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
+from tomopose.manipulator.poses import PIVOT_TOLERANCE_MM, PoseSequence
+
+SCANNER_TOLERANCE = 1e-9
+
+
+def _require_same_pivot(calibration: Calibration, poses: PoseSequence) -> None:
+    if calibration.pivot is None or poses.pivot is None:
+        return
+    off = np.abs(np.asarray(poses.pivot) - calibration.pivot).max()
+    if off > PIVOT_TOLERANCE_MM:
+        raise InputError(
+            f"the scan's pivot {np.asarray(poses.pivot)} mm is not the calibration's {calibration.pivot} mm (off by "
+            f"{off:.6g} mm): a scan about another pivot would be wrong by (1 - R) times that; set the calibration's "
+            "pivot or calibrate again"
+        )
+
+
+def _require_same_scanner(calibration: Calibration, scanner: Scanner) -> None:
+    own = calibration.scanner
+    freed = {p.name for p in calibration.parameters}
+    for name in ("n_u", "n_v", *PARAMETER_UNITS):
+        a, b = getattr(own, name), getattr(scanner, name)
+        if name in freed or (name == "p_u" and "pitch_ratio" in freed):
+            continue
+        if abs(a - b) > SCANNER_TOLERANCE * max(1.0, abs(a)):
+            raise InputError(
+                f"the scanner differs from the calibration's: {name} is {b:.9g}, not {a:.9g}; matrices hold only for "
+                "the scanner that was calibrated"
+            )
+
+
+def projection_matrices(
+    calibration: Calibration,
+    poses: PoseSequence,
+    *,
+    binning: int = 1,
+    scanner: Scanner | None = None,
+    points: Any = None,
+) -> ProjectionMatrices:
+    """The matrices of a scan, points of W (mm, object at home) to pixels.  Eq. (5).
+
+    Parameters
+    ----------
+    calibration: as of `calibrate`; its identified manipulator errors are applied to the poses.
+    poses:       the scan's poses and table angles.
+    binning:     matrices for images averaged over binning x binning pixels.
+    scanner:     if given, must be the calibration's, or InputError says where it differs.
+    points:      (m, 3) mm in W where `points_sigma` is predicted; by default the corners and centre of the volume that
+                 the field of view covers at home.
+
+    Raises
+    ------
+    InputError  another pivot or scanner than the calibration's.
+    """
+    _require_same_pivot(calibration, poses)
+    if scanner is not None:
+        _require_same_scanner(calibration, scanner)
+    scale = float(calibration.manipulator.get("translation_scale", 1.0))
+    if calibration.model != "rigid":
+        from tomopose.manipulator.error_models import corrected_poses
+
+        poses = corrected_poses(calibration.manipulator, poses)
+    elif scale != 1.0:
+        poses = replace(poses, T_MH=replace(poses.T_MH, t=scale * poses.T_MH.t))
+    own = calibration.scanner
+    alpha = np.zeros(len(poses)) if poses.alpha is None else poses.alpha
+    x_W = field_of_view_points(own) if points is None else np.asarray(points, dtype=np.float64)
+    matrices = ProjectionMatrices(
+        P=eq5_matrices(own, T_HT=calibration.T_HT, T_MH=poses.T_MH, alpha=alpha),
+        n_u=own.n_u,
+        n_v=own.n_v,
+        p_u=own.p_u,
+        p_v=own.p_v,
+        pose_id=poses.pose_id,
+        points_sigma=matrix_point_sigma(calibration, poses, x_W),
+        scanner=own,
+    )
+    return matrices if binning == 1 else matrices.binned(binning)

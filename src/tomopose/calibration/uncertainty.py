@@ -1,0 +1,40 @@
+"""Covariances in the tangent space, and what they mean in angles, pixels, micrometres and lengths.
+
+The covariance of an optimum is (J^T C^-1 J + priors)^-1.  Where chi2 lies above the value that right covariances exceed
+in one run of a hundred, the stated sigmas of the centres are too small for what the fit leaves, and the covariance is
+multiplied by chi2/dof (the Birge ratio squared).  It is never narrowed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import chdtri
+
+from tomopose.geometry.rotations import R_x, R_y, angles_from_rotation
+from tomopose.units import Array
+
+WIDENING_PROBABILITY = 0.01
+
+
+def inverse_information(N: Array) -> Array:
+    """N^-1 by its scaled eigenvalues; directions without information get an infinite variance's stand-in, 1e300."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
+    value, V = np.linalg.eigh(N * scale[:, None] * scale)
+    V = scale[:, None] * V
+    C = (V / np.maximum(value, 1e-15)) @ V.T
+    return (C + C.T) / 2
+
+
+def widening(chi2: float, dof: int) -> float:
+    """The factor on the covariance by the rule above: 1 or chi2/dof."""
+    if dof <= 0:
+        return 1.0
+    return chi2 / dof if chi2 > chdtri(dof, WIDENING_PROBABILITY) else 1.0
+
+
+def angles_by_tangent(R: Array) -> Array:
+    """(3, 3): derivative of the angles of R = R_x(a) R_y(b) R_z(c) by w in exp(w) R; nan at the gimbal lock."""
+    a, b, _ = angles_from_rotation(R)
+    # w = e_x da + R_x e_y db + R_x R_y e_z dc
+    E = np.column_stack([[1.0, 0.0, 0.0], R_x(a)[:, 1], (R_x(a) @ R_y(b))[:, 2]])
+    return np.linalg.inv(E) if abs(np.cos(b)) > 1e-6 else np.full((3, 3), np.nan)
