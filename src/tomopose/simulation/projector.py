@@ -1,0 +1,239 @@
+"""The ideal detector image: transmission averaged over each pixel, exact at edges, cheap elsewhere.
+
+Rays go through the pixels' corners.  Where a pixel and its neighbours see the same surfaces and the transmission is
+smooth, its mean follows from the corners (bilinear with the curvature's correction).  Everywhere else the pixel is cut in
+f x f cells, and a cell with an edge is sampled at the points of a Fibonacci lattice, which no straight edge can follow.
+The result has f x f cells a pixel, so that blur acts before the pixel integrates, as it does in a scintillator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from tomopose.errors import InputError, OutOfViewError
+from tomopose.geometry.frames import Frame
+from tomopose.geometry.scanner import Scanner
+from tomopose.geometry.transforms import RigidTransform
+from tomopose.simulation.rays import LARGEST, Compiled, trace
+from tomopose.simulation.spectrum import Beam
+from tomopose.units import Array
+
+EDGE_POINTS, EDGE_STEP = 89, 55
+"""Fibonacci lattice of a cell with an edge: points (i / 89, 55 i / 89 mod 1)."""
+NEAR_POINTS, NEAR_STEP = 13, 8
+"""The same for a cell beside an edge."""
+SMOOTH = 2e-4
+"""Largest third difference of transmission over the corners that counts as smooth."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Where one frame looks from: source (3,), pixel (0, 0)'s centre O, pixel steps U and V (3,), in W, mm."""
+
+    source: Array
+    O: Array
+    U: Array
+    V: Array
+
+    @classmethod
+    def of(cls, scanner: Scanner, source_shift: Any = (0.0, 0.0, 0.0)) -> View:
+        """The scanner's view; source_shift (3,) mm moves the source in S against the panel (focal spot)."""
+        U, V, O = scanner.panel
+        T_SW = scanner.T_WS.inv
+        return cls(source=T_SW.apply(np.asarray(source_shift, dtype=np.float64)), O=T_SW.apply(O), U=T_SW.R @ U,
+                   V=T_SW.R @ V)
+
+    def project(self, x: Array) -> Array:
+        """Pixels (m, 2) of points (m, 3) of W; OutOfViewError where one lies behind the source."""
+        h = np.linalg.solve(np.column_stack([self.U, self.V, self.O - self.source]), (x - self.source).T)
+        if (h[2] <= 0).any():
+            raise OutOfViewError("the object reaches behind the source; move it away from it or make it smaller")
+        return np.asarray((h[:2] / h[2]).T)
+
+
+def in_bands(work: Callable[[int, int], None], n: int, threads: int) -> None:
+    """work(lo, hi) over [0, n) in bands of rows, on that many threads (the kernels release the interpreter's lock)."""
+    if threads <= 1 or n < 2 * threads:
+        work(0, n)
+        return
+    step = max(1, n // (8 * threads))
+    starts = range(0, n, step)
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(lambda lo: work(lo, min(lo + step, n)), starts))
+
+
+@njit(cache=True, nogil=True)
+def _at(c: Any, w: Any, mu: Any, s: Any, O: Any, U: Any, V: Any, u: float, v: float, d: Any, T: Any, S: Any, L: Any) -> Any:
+    """(transmission, signature) at pixel coordinates (u, v)."""
+    kind, p, R, t, ops, first, material, centre, radius = c
+    for k in range(3):
+        d[k] = O[k] + u * U[k] + v * V[k] - s[k]
+    length = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    for k in range(3):
+        d[k] /= length
+    signature = trace(kind, p, R, t, ops, first, material, centre, radius, s, d, T, S, L)
+    if signature == 0:
+        return 1.0, signature
+    total = 0.0
+    for e in range(len(w)):
+        x = 0.0
+        for m in range(len(L)):
+            x += mu[e, m] * L[m]
+        total += w[e] * np.exp(-x)
+    return total, signature
+
+
+@njit(cache=True, nogil=True)
+def _corners(c: Any, w: Any, mu: Any, s: Any, O: Any, U: Any, V: Any, depth: int, u_0: int, v_0: int, mask: Any,
+             j_0: int, j_1: int, I: Any, seen: Any) -> bool:
+    T, S = np.empty((depth + 3, LARGEST)), np.empty((depth + 3, LARGEST + 1), dtype=np.int64)
+    L, d = np.empty(mu.shape[1]), np.empty(3)
+    fine = True
+    for j in range(j_0, j_1):
+        for i in range(I.shape[1]):
+            I[j, i], seen[j, i] = 1.0, 0
+            if mask[j, i]:
+                I[j, i], seen[j, i] = _at(c, w, mu, s, O, U, V, u_0 + i - 0.5, v_0 + j - 0.5, d, T, S, L)
+                if seen[j, i] < 0:
+                    fine = False
+    return fine
+
+
+@njit(cache=True, nogil=True)
+def _smooth(I: Any, seen: Any, j: int, i: int) -> bool:
+    """Whether the pixel with lower corner (j, i) and its eight neighbours see the same surfaces, smoothly."""
+    here = seen[j, i]
+    j_0, j_1, i_0, i_1 = max(j - 1, 0), min(j + 2, I.shape[0] - 1), max(i - 1, 0), min(i + 2, I.shape[1] - 1)
+    for a in range(j_0, j_1 + 1):
+        for b in range(i_0, i_1 + 1):
+            if seen[a, b] != here:
+                return False
+    if here == 0:
+        return True
+    if j_1 - j_0 < 3 or i_1 - i_0 < 3:
+        return False
+    for k in range(2):
+        if abs(I[j - 1, i + k] - 3 * I[j, i + k] + 3 * I[j + 1, i + k] - I[j + 2, i + k]) > SMOOTH:
+            return False
+        if abs(I[j + k, i - 1] - 3 * I[j + k, i] + 3 * I[j + k, i + 1] - I[j + k, i + 2]) > SMOOTH:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _cells(c: Any, w: Any, mu: Any, s: Any, O: Any, U: Any, V: Any, depth: int, u_0: int, v_0: int, I: Any, seen: Any,
+           f: int, j_0: int, j_1: int, weight: float, out: Any) -> None:
+    """Add weight x (mean transmission of the f x f cells of the pixels in rows j_0 to j_1) to `out`."""
+    T, S = np.empty((depth + 3, LARGEST)), np.empty((depth + 3, LARGEST + 1), dtype=np.int64)
+    L, d = np.empty(mu.shape[1]), np.empty(3)
+    nodes, node_seen = np.empty((f + 1, f + 1)), np.empty((f + 1, f + 1), dtype=np.int64)
+    h = 1.0 / f
+    # Mean over cell b of x (1 - x) / 2: what bilinear interpolation between the corners misses per unit of curvature.
+    bow = np.empty(f)
+    for b in range(f):
+        lo, hi = b * h, (b + 1) * h
+        bow[b] = ((hi**2 - lo**2) / 4 - (hi**3 - lo**3) / 6) / h
+    for j in range(j_0, j_1):
+        for i in range(I.shape[1] - 1):
+            if _smooth(I, seen, j, i):
+                if seen[j, i] == 0:
+                    for a in range(f):
+                        for b in range(f):
+                            out[j * f + a, i * f + b] += weight
+                    continue
+                f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
+                I_uu = 0.5 * (I[j, i - 1] - f_00 - f_01 + I[j, i + 2] + I[j + 1, i - 1] - f_10 - f_11 + I[j + 1, i + 2]) / 2
+                I_vv = 0.5 * (I[j - 1, i] - f_00 - f_10 + I[j + 2, i] + I[j - 1, i + 1] - f_01 - f_11 + I[j + 2, i + 1]) / 2
+                for a in range(f):
+                    y = (a + 0.5) * h
+                    for b in range(f):
+                        x = (b + 0.5) * h
+                        value = (1 - y) * ((1 - x) * f_00 + x * f_01) + y * ((1 - x) * f_10 + x * f_11)
+                        out[j * f + a, i * f + b] += weight * (value - bow[b] * I_uu - bow[a] * I_vv)
+                continue
+            left, low = u_0 + i - 0.5, v_0 + j - 0.5
+            for a in range(f + 1):
+                for b in range(f + 1):
+                    if a in (0, f) and b in (0, f):
+                        node_seen[a, b] = seen[j + a // f, i + b // f]
+                    else:
+                        _, node_seen[a, b] = _at(c, w, mu, s, O, U, V, left + b * h, low + a * h, d, T, S, L)
+            for a in range(f):
+                for b in range(f):
+                    n, step = NEAR_POINTS, NEAR_STEP
+                    mark = node_seen[a, b]
+                    if node_seen[a + 1, b] != mark or node_seen[a, b + 1] != mark or node_seen[a + 1, b + 1] != mark:
+                        n, step = EDGE_POINTS, EDGE_STEP
+                    elif mark == 0:
+                        out[j * f + a, i * f + b] += weight
+                        continue
+                    total = 0.0
+                    for q in range(n):
+                        x, y = (q + 0.5) / n, ((q * step) % n + 0.5) / n
+                        total += _at(c, w, mu, s, O, U, V, left + (b + x) * h, low + (a + y) * h, d, T, S, L)[0]
+                    out[j * f + a, i * f + b] += weight * total / n
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """A rectangle of pixels: u from u_0 to u_0 + n_u, v likewise."""
+
+    u_0: int
+    v_0: int
+    n_u: int
+    n_v: int
+
+
+def shadow(compiled: Compiled, view: View, T_FW: dict[Frame, RigidTransform], scanner: Scanner, margin: int) -> Window | None:
+    """The pixels that the solids can shade, with a margin, cut `margin` outside the detector; None where there are none."""
+    boxes = shadow_boxes(compiled, view, T_FW)
+    lo, hi = np.floor(boxes[:, 0].min(axis=0)) - margin, np.ceil(boxes[:, 1].max(axis=0)) + margin
+    u_0, v_0 = max(int(lo[0]), -margin), max(int(lo[1]), -margin)
+    u_1, v_1 = min(int(hi[0]) + 1, scanner.n_u + margin), min(int(hi[1]) + 1, scanner.n_v + margin)
+    seen = u_1 > max(u_0, 0) and v_1 > max(v_0, 0) and u_0 < scanner.n_u and v_0 < scanner.n_v
+    return Window(u_0=u_0, v_0=v_0, n_u=u_1 - u_0, n_v=v_1 - v_0) if seen else None
+
+
+def shadow_boxes(compiled: Compiled, view: View, T_FW: dict[Frame, RigidTransform]) -> Array:
+    """(m, 2, 2): lowest and highest (u, v) of each solid's outline."""
+    boxes = np.empty((len(compiled.frame), 2, 2))
+    for k, (frame, corners) in enumerate(zip(compiled.frame, compiled.corners, strict=True)):
+        x = view.project(T_FW[frame].apply(corners))
+        boxes[k] = x.min(axis=0), x.max(axis=0)
+    return boxes
+
+
+def add_transmission(
+    out: Array, window: Window, compiled: Compiled, beam: Beam, view: View, T_FW: dict[Frame, RigidTransform], *, f: int,
+    weight: float = 1.0, threads: int = 1,
+) -> None:
+    """Add weight x transmission to `out` (n_v f, n_u f), the cells of the window's pixels.
+
+    T_FW: each frame's transform to W.  Raises InputError where a ray crosses more surfaces than `LARGEST`.
+    """
+    R, t, centre = compiled.in_world(T_FW)
+    c = (compiled.kind, compiled.p, R, t, compiled.ops, compiled.first, compiled.material, centre, compiled.radius)
+    I = np.empty((window.n_v + 1, window.n_u + 1))
+    seen = np.empty(I.shape, dtype=np.int64)
+    mask = np.zeros(I.shape, dtype=np.bool_)
+    for (u_lo, v_lo), (u_hi, v_hi) in shadow_boxes(compiled, view, T_FW):
+        j = slice(max(int(np.floor(v_lo)) - window.v_0, 0), max(int(np.ceil(v_hi)) - window.v_0 + 2, 0))
+        i = slice(max(int(np.floor(u_lo)) - window.u_0, 0), max(int(np.ceil(u_hi)) - window.u_0 + 2, 0))
+        mask[j, i] = True
+    common = (c, beam.w, beam.mu, view.source, view.O, view.U, view.V, compiled.depth, window.u_0, window.v_0)
+    fine = [True]
+
+    def corners(lo: int, hi: int) -> None:
+        if not _corners(*common, mask, lo, hi, I, seen):
+            fine[0] = False
+
+    in_bands(corners, window.n_v + 1, threads)
+    if not fine[0]:
+        raise InputError(f"a ray crosses more than {LARGEST} surfaces of one solid; split the solid in several")
+    in_bands(lambda lo, hi: _cells(*common, I, seen, f, lo, hi, weight, out), window.n_v, threads)
