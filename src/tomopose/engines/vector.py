@@ -1,0 +1,177 @@
+"""LLVM vector building blocks of the CPU kernels: W voxels of a column, or W rays of adjacent detector rows, at a time.
+
+Numba's own vectoriser turns neither the bilinear look-up of back-projection nor Joseph's into vector code, because the
+loads are gathers and the stores may alias.  The blocks below say it to LLVM directly.  A bilinear look-up needs two
+loads a lane: the pair of neighbours along the fastest axis comes as one 64 bit word.  LLVM maps the vectors to whatever
+the processor has; W is 16 with AVX-512 and 8 elsewhere.  The same results come from the plain kernels in kernels.py.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import llvmlite.binding
+import llvmlite.ir as ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+F32, I32, I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
+
+
+def _host_width() -> int:
+    try:
+        features = llvmlite.binding.get_host_cpu_features()
+    except RuntimeError:  # the host is unknown to LLVM
+        return 8
+    return 16 if features.get("avx512f") else 8
+
+
+W = _host_width()
+"""Lanes of a vector."""
+
+BIAS = 1 << 30
+VF, VI = ir.VectorType(F32, W), ir.VectorType(I32, W)
+
+
+def _splat(builder: Any, x: Any) -> Any:
+    vector = ir.VectorType(x.type, W)
+    one = builder.insert_element(ir.Constant(vector, ir.Undefined), x, ir.Constant(I32, 0))
+    return builder.shuffle_vector(one, ir.Constant(vector, ir.Undefined), ir.Constant(VI, [0] * W))
+
+
+def _call(builder: Any, name: str, *arguments: Any) -> Any:
+    kind = ir.FunctionType(VF, [VF] * len(arguments))
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{W}f32"), arguments)
+
+
+def _data(context: Any, builder: Any, array_type: Any, array: Any) -> Any:
+    return cgutils.create_struct_proxy(array_type)(context, builder, array).data
+
+
+def _at(builder: Any, data: Any, index: Any, kind: Any) -> Any:
+    return builder.bitcast(builder.gep(data, [index], source_etype=F32), kind.as_pointer())
+
+
+def _load(builder: Any, data: Any, index: Any) -> Any:
+    return builder.load(_at(builder, data, index, VF), align=4, typ=VF)
+
+
+def _pairs(builder: Any, data: Any, base: Any, offset: Any) -> tuple[Any, Any]:
+    """Lane by lane, data[base + offset] and its right neighbour."""
+    words = ir.Constant(ir.VectorType(I64, W), ir.Undefined)
+    # With a bias the offsets are positive, and widening an unsigned lane to an address costs nothing.
+    start = builder.gep(data, [builder.sub(base, ir.Constant(I64, BIAS))], source_etype=F32)
+    offset = builder.add(offset, ir.Constant(VI, [BIAS] * W))
+    for lane in range(W):
+        o = builder.zext(builder.extract_element(offset, ir.Constant(I32, lane)), I64)
+        word = builder.load(_at(builder, start, o, I64), align=4, typ=I64)
+        words = builder.insert_element(words, word, ir.Constant(I32, lane))
+    both = builder.bitcast(words, ir.VectorType(F32, 2 * W))
+    undefined = ir.Constant(both.type, ir.Undefined)
+    even = ir.Constant(VI, list(range(0, 2 * W, 2)))
+    odd = ir.Constant(VI, list(range(1, 2 * W, 2)))
+    return builder.shuffle_vector(both, undefined, even), builder.shuffle_vector(both, undefined, odd)
+
+
+def _bilinear(builder: Any, data: Any, base: Any, row: Any, a: Any, b: Any) -> Any:
+    """data at the fractional position (a, b): a counts rows of length `row` (int32), b is the contiguous axis."""
+    floor_a, floor_b = _call(builder, "floor", a), _call(builder, "floor", b)
+    f_a, f_b = builder.fsub(a, floor_a), builder.fsub(b, floor_b)
+    offset = builder.add(
+        builder.mul(builder.fptosi(floor_a, VI), _splat(builder, row)), builder.fptosi(floor_b, VI)
+    )
+    p00, p01 = _pairs(builder, data, base, offset)
+    p10, p11 = _pairs(builder, data, builder.add(base, builder.sext(row, I64)), offset)
+    low = _call(builder, "fma", f_b, builder.fsub(p01, p00), p00)
+    high = _call(builder, "fma", f_b, builder.fsub(p11, p10), p10)
+    return _call(builder, "fma", f_a, builder.fsub(high, low), low)
+
+
+def _back_block(inverse_square: bool) -> Any:
+    @intrinsic  # type: ignore[misc]
+    def block(
+        typingctx: Any, column: Any, z: Any, image: Any, base: Any, row: Any, first: Any, scale: Any,
+        u: Any, du: Any, v: Any, dv: Any, w: Any, dw: Any,
+    ) -> Any:
+        """column[z + l] += weight * image at ((u + l du) / (w + l dw), (v + l dv) / (w + l dw)), lanes first <= l < W.
+
+        image[base] is the pixel the two quotients count from; weight is `scale`, or scale / (w + l dw)^2.
+        Lanes below `first` look up the place of lane `first` and add nothing.
+        """
+        f = types.float32
+        signature = types.void(column, types.int64, image, types.int64, types.int32, types.int32, f, f, f, f, f, f, f)
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            column, z, image, base, row, first, scale, u, du, v, dv, w, dw = arguments
+            target = _data(context, builder, signature.args[0], column)
+            pixels = _data(context, builder, signature.args[2], image)
+            lanes = ir.Constant(VF, [float(lane) for lane in range(W)])
+            start = _splat(builder, builder.sitofp(first, F32))
+            active = builder.fcmp_ordered(">=", lanes, start)
+            lane = builder.select(active, lanes, start)
+
+            def along(origin: Any, step: Any) -> Any:
+                return _call(builder, "fma", lane, _splat(builder, step), _splat(builder, origin))
+
+            reciprocal = builder.fdiv(ir.Constant(VF, [1.0] * W), along(w, dw))
+            value = _bilinear(
+                builder, pixels, base, row,
+                builder.fmul(along(u, du), reciprocal), builder.fmul(along(v, dv), reciprocal),
+            )
+            weight = _splat(builder, scale)
+            if inverse_square:
+                weight = builder.fmul(weight, builder.fmul(reciprocal, reciprocal))
+            weight = builder.select(active, weight, ir.Constant(VF, [0.0] * W))
+            result = _call(builder, "fma", value, weight, _load(builder, target, z))
+            builder.store(result, _at(builder, target, z, VF), align=4)
+            return context.get_dummy_value()
+
+        return signature, generate
+
+    return block
+
+
+back_block = _back_block(inverse_square=False)
+back_block_inverse_square = _back_block(inverse_square=True)
+
+
+@intrinsic  # type: ignore[misc]
+def forward_block(
+    typingctx: Any, volume: Any, base: Any, plane: Any, row: Any, rays: Any, k_0: Any, k_1: Any, centre: Any,
+    a_end: Any, b_end: Any, sums: Any, at: Any,
+) -> Any:
+    """sums[at + l] = sum over planes k_0 <= k < k_1 of the volume at (a_l(k), b_l(k)): Joseph's sum for W rays.
+
+    volume[base] is voxel (0, 0) of plane 0; planes lie `plane` elements apart, rows along a `row` (int32), b is
+    contiguous.  rays holds a, da, b, db for each lane (4 W values): a(k) = a + (k - centre) da.  Positions are held
+    within [-1, a_end] and [-1, b_end], where the volume's margin is zero.
+    """
+    signature = types.void(
+        volume, types.int64, types.int64, types.int32, rays, types.int64, types.int64, types.float32, types.float32,
+        types.float32, sums, types.int64,
+    )
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        volume, base, plane, row, rays, k_0, k_1, centre, a_end, b_end, sums, at = arguments
+        voxels = _data(context, builder, signature.args[0], volume)
+        table = _data(context, builder, signature.args[4], rays)
+        target = _data(context, builder, signature.args[10], sums)
+        a, da, b, db = (_load(builder, table, ir.Constant(I64, i * W)) for i in range(4))
+        a_end, b_end, low = _splat(builder, a_end), _splat(builder, b_end), ir.Constant(VF, [-1.0] * W)
+        total = cgutils.alloca_once_value(builder, ir.Constant(VF, [0.0] * W))
+        with cgutils.for_range_slice(builder, k_0, k_1, ir.Constant(I64, 1), I64) as (k, _count):
+            step = _splat(builder, builder.fsub(builder.sitofp(k, F32), centre))
+
+            def held(position: Any, slope: Any, end: Any, step: Any = step) -> Any:
+                place = _call(builder, "fma", step, slope, position)
+                place = builder.select(builder.fcmp_ordered(">", place, low), place, low)
+                return builder.select(builder.fcmp_ordered("<", place, end), place, end)
+
+            start = builder.add(base, builder.mul(k, plane))
+            value = _bilinear(builder, voxels, start, row, held(a, da, a_end), held(b, db, b_end))
+            builder.store(builder.fadd(builder.load(total, typ=VF), value), total)
+        builder.store(builder.load(total, typ=VF), _at(builder, target, at, VF), align=4)
+        return context.get_dummy_value()
+
+    return signature, generate
