@@ -24,6 +24,8 @@ from tomopose.units import Array
 
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 DECIMAL_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?")
+NUMPY_REPR = re.compile(r"np\.float64\((?P<number>.*)\)")
+"""What repr() of a NumPy 2 scalar leaves in tables written by scripts; the number in it is exact."""
 PLACEHOLDER = re.compile(r"[+-]?9{4,}(\.9*0*)?")
 """9999, -99999, 9999.9 ...: how controllers and spreadsheets write "no value"."""
 COMMENT = re.compile(r"#\s*(?P<key>[A-Za-z][A-Za-z0-9_ -]*?)\s*:\s*(?P<value>.*?)\s*$")
@@ -76,6 +78,8 @@ class TextTable:
             raise InputError(f"{self.where(row, column)}: the cell is blank; give the number or leave the row out")
         if self.decimal_comma:
             cell = cell.replace(",", ".")
+        if written := NUMPY_REPR.fullmatch(cell):
+            cell = written["number"]
         if not NUMBER.fullmatch(cell):
             raise InputError(f"{self.where(row, column)}: {cell!r} is no finite number")
         if PLACEHOLDER.fullmatch(cell):

@@ -1,0 +1,104 @@
+"""`tomopose calibrate`: poses and radiographs (or observations) to calibration.json, observations.csv, report.html."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tomopose.cli.common import (
+    BallOption,
+    ForceOption,
+    JsonOption,
+    PosesOption,
+    QuietOption,
+    Say,
+    ScannerOption,
+    WorkersOption,
+    arguments,
+    names,
+)
+
+EPILOG = "Example: tomopose calibrate --scanner scanner.json --poses poses.csv --images radiographs/ --out cal/"
+
+
+def register(app: typer.Typer) -> None:
+    app.command("calibrate", epilog=EPILOG)(calibrate)
+
+
+def calibrate(
+    scanner: ScannerOption,
+    poses: PosesOption,
+    out: Annotated[Path, typer.Option("--out", help="Folder for calibration.json, observations.csv, report.html.")],
+    images: Annotated[
+        str | None, typer.Option("--images", help="Folder, glob or multi-page file of radiographs.")
+    ] = None,
+    observations: Annotated[
+        Path | None, typer.Option("--observations", help="observations.csv, instead of --images.")
+    ] = None,
+    ball_diameter: BallOption = 8.0,
+    manipulator: Annotated[
+        Path | None, typer.Option("--manipulator", help="hexapod.json or robot.json: nominal geometry and its priors.")
+    ] = None,
+    model: Annotated[
+        str, typer.Option("--model", help="auto, rigid, kinematic or slack: how the manipulator may err.")
+    ] = "auto",
+    free: Annotated[
+        str | None, typer.Option("--free", help="Scanner parameters to estimate too, e.g. d_SR,u_0.")
+    ] = None,
+    fix: Annotated[
+        str | None, typer.Option("--fix", help="Parameters to hold although scanner.json gives them a sigma.")
+    ] = None,
+    dark: Annotated[str | None, typer.Option("--dark", help="Dark frames, with --flat.")] = None,
+    flat: Annotated[str | None, typer.Option("--flat", help="Flat frames: detect on the transmission.")] = None,
+    dataset: Annotated[str | None, typer.Option("--dataset", help="Dataset in an HDF5 file.")] = None,
+    workers: WorkersOption = 1,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """Find how the manipulator sits in the scanner.  No start value is needed.
+
+    Exit code 3 says that the calibration finished but is not trustworthy; the report leads with the reasons.
+    """
+    from dataclasses import replace
+
+    import tomopose as tp
+    from tomopose.cli.job import (
+        calibration_summary,
+        exit_code,
+        image_source,
+        observe,
+        open_for,
+        require_free_folder,
+        write_calibration_folder,
+    )
+    from tomopose.provenance import provenance
+
+    if (images is None) == (observations is None):
+        raise typer.BadParameter("give either --images or --observations", param_hint="--images / --observations")
+    say = Say(json=as_json, quiet=quiet)
+    require_free_folder(out, force=force)
+    geometry, sequence = tp.read_scanner(scanner), tp.read_poses(poses)
+    errors = None if manipulator is None else tp.read_manipulator(manipulator)
+    stack = None
+    if observations is not None:
+        observed = tp.read_observations(observations)
+    else:
+        stack = open_for(say, image_source(str(images)), geometry, sequence, dark=dark, flat=flat, dataset=dataset)
+        observed = observe(say, geometry, stack, sequence, ball_diameter=ball_diameter, workers=workers)
+    result = tp.calibrate(
+        geometry, sequence, observed, manipulator=errors, model=model, free=names(free), fix=names(fix)
+    )
+    given = [scanner, poses, *(p for p in (observations, manipulator) if p is not None)]
+    made = provenance(
+        inputs=given,
+        arguments=arguments(model=model, free=free, fix=fix, ball_diameter_mm=ball_diameter,
+                            images=None if images is None else len(observed)),
+    )
+    result = replace(result, provenance=made)
+    write_calibration_folder(out, result, observed, sequence, images=stack, force=force)
+    summary, lines = calibration_summary(result)
+    say.result({"out": out.name, **summary}, [*lines, f"{out}: calibration.json, observations.csv, report.html"])
+    return exit_code(result)

@@ -1,0 +1,96 @@
+"""What every verb shares: options, progress, and the two ways of saying a result (for people, for programs)."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+OK, BAD_INPUT, USAGE, NOT_TRUSTWORTHY, MISSING, INTERNAL = 0, 1, 2, 3, 4, 70
+
+Progress = Callable[[int, int], None]
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object on standard output.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")]
+ScannerOption = Annotated[Path, typer.Option("--scanner", help="scanner.json: the scanner's known geometry.")]
+PosesOption = Annotated[Path, typer.Option("--poses", help="poses.csv: the manipulator's poses, one row an image.")]
+WorkersOption = Annotated[int, typer.Option("--workers", min=1, help="Processes to use.")]
+BallOption = Annotated[float, typer.Option("--ball-diameter-mm", help="Nominal diameter of the ball, mm.")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Say:
+    """How a verb speaks: results to standard output, notes and progress to standard error."""
+
+    json: bool = False
+    quiet: bool = False
+
+    def note(self, text: str) -> None:
+        if not self.quiet and not self.json:
+            print(text, file=sys.stderr)
+
+    def result(self, summary: Mapping[str, Any], lines: Sequence[str] = ()) -> None:
+        """The summary as JSON, or its lines for people."""
+        from tomopose.files import plain
+
+        if self.json:
+            print(json.dumps(plain(summary), ensure_ascii=False, allow_nan=False))
+        elif not self.quiet:
+            for line in lines:
+                print(line)
+
+    @contextlib.contextmanager
+    def progress(self, label: str) -> Iterator[Progress]:
+        """A bar with the time left on a terminal, a plain line at every tenth elsewhere, nothing when quiet."""
+        if self.quiet or self.json:
+            yield lambda done, total: None
+        elif sys.stderr.isatty():
+            yield from _bar(label)
+        else:
+            yield _lines(label)
+
+
+def _bar(label: str) -> Iterator[Progress]:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import Progress as RichProgress
+
+    columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
+               TimeRemainingColumn())
+    with RichProgress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task(label, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _lines(label: str) -> Progress:
+    start = time.monotonic()
+    said = -1
+
+    def update(done: int, total: int) -> None:
+        nonlocal said
+        tenth = 10 * done // max(total, 1)
+        if tenth > said:
+            said = tenth
+            elapsed = time.monotonic() - start
+            left = f", {elapsed * (total - done) / done:.0f} s left" if 0 < done < total else ""
+            print(f"{label}: {done} of {total}{left}", file=sys.stderr, flush=True)
+
+    return update
+
+
+def names(text: str | None) -> tuple[str, ...]:
+    """`a,b,c` as names."""
+    return tuple(part.strip() for part in text.split(",") if part.strip()) if text else ()
+
+
+def arguments(**values: Any) -> dict[str, Any]:
+    """The arguments of a verb for the provenance: paths by their names alone."""
+    return {k: v.name if isinstance(v, Path) else v for k, v in values.items() if v is not None}

@@ -1,0 +1,74 @@
+"""`tomopose detect`: radiographs to observations.csv."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tomopose.cli.common import (
+    OK,
+    BallOption,
+    ForceOption,
+    JsonOption,
+    QuietOption,
+    Say,
+    ScannerOption,
+    WorkersOption,
+)
+
+EPILOG = "Example: tomopose detect --scanner scanner.json --images radiographs/ --poses poses.csv --out observations.csv"
+
+ImagesOption = Annotated[str, typer.Option("--images", help="Folder, glob or multi-page file of radiographs.")]
+
+
+def register(app: typer.Typer) -> None:
+    app.command("detect", epilog=EPILOG)(detect)
+
+
+def detect(
+    scanner: ScannerOption,
+    images: ImagesOption,
+    out: Annotated[Path, typer.Option("--out", help="observations.csv to write.")],
+    poses: Annotated[
+        Path | None, typer.Option("--poses", help="poses.csv; gives the pose ids. Without it: the images' names.")
+    ] = None,
+    ball_diameter: BallOption = 8.0,
+    dark: Annotated[str | None, typer.Option("--dark", help="Dark frames, with --flat.")] = None,
+    flat: Annotated[str | None, typer.Option("--flat", help="Flat frames: detect on the transmission.")] = None,
+    dataset: Annotated[str | None, typer.Option("--dataset", help="Dataset in an HDF5 file.")] = None,
+    workers: WorkersOption = 1,
+    dask: Annotated[str | None, typer.Option("--dask", help="Address of a dask scheduler to use instead.")] = None,
+    resume: Annotated[
+        Path | None, typer.Option("--resume", help="Journal of finished images: go on where a run was interrupted.")
+    ] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """Find the projection of the ball's centre in each radiograph, with its uncertainty.
+
+    An image that cannot be measured is listed with the reason, never silently measured.
+    """
+    import tomopose as tp
+    from tomopose.cli.job import executor_of, image_source, observe, open_for
+    from tomopose.files import require_absent
+
+    say = Say(json=as_json, quiet=quiet)
+    require_absent(out, force=force)
+    geometry = tp.read_scanner(scanner)
+    sequence = None if poses is None else tp.read_poses(poses)
+    stack = open_for(say, image_source(images), geometry, sequence, dark=dark, flat=flat, dataset=dataset)
+    with executor_of(dask) as executor:
+        found = observe(
+            say, geometry, stack, sequence, ball_diameter=ball_diameter, workers=workers, executor=executor,
+            journal=resume,
+        )
+    tp.write_observations(out, found, force=force)
+    missed = {i: s for i, s, seen in zip(found.pose_id, found.status or (), found.seen, strict=True) if not seen}
+    say.result(
+        {"out": out.name, "images": len(found), "measured": int(found.seen.sum()), "not_measured": missed},
+        [f"{out}: {int(found.seen.sum())} of {len(found)} balls measured", *(f"  {k}: {v}" for k, v in missed.items())],
+    )
+    return OK

@@ -1,0 +1,158 @@
+"""The steps that `detect`, `calibrate` and `demo` share: radiographs to observations, and a result to its folder."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tomopose.cli.common import NOT_TRUSTWORTHY, OK, Say
+
+if TYPE_CHECKING:
+    from tomopose import BallObservations, Calibration, PoseSequence, ProjectionMatrices, Scanner
+    from tomopose.report.thumbnails import Thumbnail
+
+WORST_SHOWN = 12
+
+
+def image_source(text: str) -> str | Path:
+    """What --images names: a folder or file as a path, a glob as it is."""
+    return text if any(c in text for c in "*?[") else Path(text)
+
+
+def open_for(
+    say: Say,
+    source: str | Path,
+    scanner: Scanner,
+    poses: PoseSequence | None,
+    *,
+    dark: str | None = None,
+    flat: str | None = None,
+    dataset: str | None = None,
+) -> Any:
+    """The images of a pose table, in its order; without a table, all images in natural order."""
+    import tomopose as tp
+
+    images = tp.open_images(source, scanner, dark=dark, flat=flat, dataset=dataset)
+    for warning in images.warnings:
+        say.note(f"note: {warning}")
+    return images if poses is None else images.select(tp.pair_images(poses, images))
+
+
+@contextlib.contextmanager
+def executor_of(dask: str | None) -> Iterator[Any]:
+    """A client of the dask scheduler at that address, closed afterwards; None without an address."""
+    if dask is None:
+        yield None
+        return
+    try:
+        from distributed import Client
+    except ImportError as error:
+        from tomopose.errors import EngineMissingError
+
+        raise EngineMissingError("dask is not installed", install_line='pip install "tomopose[dask]"') from error
+    with Client(dask) as client:
+        yield client
+
+
+def require_free_folder(out: Path, *, force: bool) -> None:
+    """FileError, before any work is done, where the results would overwrite what is there."""
+    from tomopose.files import require_absent
+
+    for name in ("calibration.json", "observations.csv", "report.html"):
+        require_absent(out / name, force=force)
+
+
+def observe(
+    say: Say,
+    scanner: Scanner,
+    images: Any,
+    poses: PoseSequence | None,
+    *,
+    ball_diameter: float,
+    workers: int = 1,
+    **options: Any,
+) -> BallObservations:
+    """Find the ball in each image.  Without poses the ids are the images' names without suffix."""
+    import tomopose as tp
+
+    ids = [Path(name).stem for name in images.names] if poses is None else poses.pose_id
+    with say.progress("detecting") as progress:
+        found = tp.detect(
+            images, scanner, ball_diameter=ball_diameter, pose_id=ids, workers=workers, progress=progress, **options
+        )
+    return replace(found, image=tuple(Path(name).name for name in images.names))
+
+
+def thumbnails(observations: BallObservations, images: Any, residual: Mapping[str, float]) -> list[Thumbnail]:
+    """Pictures of the images that deserve a look: not measured ones first, then the largest residuals."""
+    from tomopose.report import thumbnail
+
+    order = sorted(
+        range(len(observations)),
+        key=lambda k: (bool(observations.seen[k]), -residual.get(observations.pose_id[k], float("inf"))),
+    )
+    shown = []
+    for k in order[:WORST_SHOWN]:
+        d = residual.get(observations.pose_id[k])
+        shown.append(
+            thumbnail(observations, k, images[k], text="not used" if d is None else f"residual {d:.4f} px")
+        )
+    return shown
+
+
+def write_calibration_folder(
+    out: Path,
+    calibration: Calibration,
+    observations: BallObservations,
+    poses: PoseSequence,
+    *,
+    images: Any = None,
+    scan: ProjectionMatrices | None = None,
+    force: bool = False,
+) -> None:
+    """calibration.json, observations.csv and report.html, all or none."""
+    import tomopose as tp
+    from tomopose.files import atomic_folder
+    from tomopose.report import calibration_report, write_report
+
+    residual = dict(zip(calibration.pose_id, calibration.d.tolist(), strict=True))
+    pictures: Sequence[Thumbnail] = () if images is None else thumbnails(observations, images, residual)
+    with atomic_folder(out, force=force) as folder:
+        tp.write_calibration(folder / "calibration.json", calibration)
+        tp.write_observations(folder / "observations.csv", observations)
+        html = calibration_report(calibration, observations=observations, poses=poses, thumbnails=pictures, scan=scan)
+        write_report(folder / "report.html", html)
+
+
+def calibration_summary(calibration: Calibration) -> tuple[dict[str, Any], list[str]]:
+    """The figures of a calibration, for programs and for people."""
+    from tomopose.units import value_with_uncertainty
+
+    summary = {
+        "verdict": calibration.verdict,
+        "reasons": list(calibration.reasons),
+        "d_rms_px": calibration.d_rms,
+        "d_rms_um": calibration.d_rms_um,
+        "chi2_dof": calibration.chi2_dof,
+        "poses_used": len(calibration.pose_id),
+        "outliers": dict(calibration.outliers),
+        "model": calibration.model,
+        "parameters": [
+            {"name": p.name, "value": p.value, "u": p.u, "unit": p.unit} for p in calibration.parameters
+        ],
+    }
+    lines = [
+        f"{calibration.verdict}: {calibration.status}",
+        *(f"  - {reason}" for reason in calibration.reasons),
+        f"  d_rms {calibration.d_rms:.4g} px ({calibration.d_rms_um:.3g} um at the object), "
+        f"{len(calibration.pose_id)} poses, {len(calibration.outliers)} set aside",
+        *(f"  {p.name:<10} {value_with_uncertainty(p.value, p.u, p.unit)}" for p in calibration.parameters),
+    ]
+    return summary, lines
+
+
+def exit_code(calibration: Calibration) -> int:
+    return OK if calibration.verdict == "trustworthy" else NOT_TRUSTWORTHY

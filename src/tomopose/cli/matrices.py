@@ -1,0 +1,60 @@
+"""`tomopose matrices`: a calibration and a scan's poses to projection matrices, eq. (5)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tomopose.cli.common import OK, ForceOption, JsonOption, PosesOption, QuietOption, Say, arguments
+
+EPILOG = "Example: tomopose matrices --calibration cal/calibration.json --poses scan.csv --binning 2 --out matrices.npz"
+
+
+def register(app: typer.Typer) -> None:
+    app.command("matrices", epilog=EPILOG)(matrices)
+
+
+def matrices(
+    calibration: Annotated[Path, typer.Option("--calibration", help="calibration.json.")],
+    poses: PosesOption,
+    out: Annotated[Path, typer.Option("--out", help="matrices.npz to write.")],
+    binning: Annotated[int, typer.Option("--binning", min=1, help="The scan's images average N x N pixels.")] = 1,
+    scanner: Annotated[
+        Path | None, typer.Option("--scanner", help="The scan's scanner.json; refused where it is another scanner.")
+    ] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """Turn a scan's poses into one 3x4 projection matrix a view, with the predicted uncertainty in pixels.
+
+    Refuses a scan with another pivot or another scanner than the calibration's.
+    """
+    import numpy as np
+
+    import tomopose as tp
+    from tomopose.files import require_absent
+    from tomopose.provenance import provenance
+
+    say = Say(json=as_json, quiet=quiet)
+    require_absent(out, force=force)
+    cal = tp.read_calibration(calibration)
+    result = tp.projection_matrices(
+        cal, tp.read_poses(poses), binning=binning, scanner=None if scanner is None else tp.read_scanner(scanner)
+    )
+    inputs = [calibration, poses, *([scanner] if scanner else [])]
+    tp.write_matrices(
+        out, result, provenance=provenance(inputs=inputs, arguments=arguments(binning=binning)), force=force
+    )
+    sigma = None if result.points_sigma is None else float(np.sqrt(np.mean(result.points_sigma**2)))
+    told = "not determinable" if sigma is None else f"{sigma:.2g} px (1 sigma, rms over the field of view)"
+    say.result(
+        {"out": out.name, "views": len(result), "n_u_px": result.n_u, "n_v_px": result.n_v, "points_sigma_px": sigma,
+         "calibration_verdict": cal.verdict},
+        [f"{out}: {len(result)} matrices for images of {result.n_u} x {result.n_v} px; uncertainty {told}"],
+    )
+    if cal.verdict != "trustworthy":
+        say.note(f"note: the calibration's verdict is {cal.verdict}: {'; '.join(cal.reasons)}")
+    return OK

@@ -1,0 +1,58 @@
+"""`tomopose report`: one offline HTML file from a result folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tomopose.cli.common import OK, ForceOption, JsonOption, QuietOption, Say
+
+EPILOG = "Example: tomopose report cal/ --poses poses.csv --scan matrices.npz --force"
+
+
+def register(app: typer.Typer) -> None:
+    app.command("report", epilog=EPILOG)(report)
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(help="Folder with calibration.json or observations.csv.")],
+    poses: Annotated[Path | None, typer.Option("--poses", help="poses.csv, for the plots by axis and angle.")] = None,
+    images: Annotated[str | None, typer.Option("--images", help="Radiographs, for pictures of detections.")] = None,
+    scan: Annotated[Path | None, typer.Option("--scan", help="matrices.npz of a scan, for its expected effect.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="The HTML file; default report.html in the folder.")] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """Write one HTML file that needs no network: verdict, parameters, residuals, pictures, the scene in 3D."""
+    import tomopose as tp
+    from tomopose.cli.job import image_source, open_for, thumbnails
+    from tomopose.errors import FileError
+    from tomopose.files import require_absent
+    from tomopose.report import calibration_report, observations_report, write_report
+
+    say = Say(json=as_json, quiet=quiet)
+    target = require_absent(out or folder / "report.html", force=force)
+    calibration_file, observations_file = folder / "calibration.json", folder / "observations.csv"
+    if not calibration_file.exists() and not observations_file.exists():
+        raise FileError(f"{folder} holds neither calibration.json nor observations.csv", path=folder)
+    observations = tp.read_observations(observations_file) if observations_file.exists() else None
+    sequence = None if poses is None else tp.read_poses(poses)
+    calibration = tp.read_calibration(calibration_file) if calibration_file.exists() else None
+    pictures = []
+    if images is not None and observations is not None and calibration is not None and sequence is not None:
+        stack = open_for(say, image_source(images), calibration.scanner, sequence)
+        residual = dict(zip(calibration.pose_id, calibration.d.tolist(), strict=True))
+        pictures = thumbnails(observations, stack, residual)
+    if calibration is not None:
+        matrices = None if scan is None else tp.read_matrices(scan)
+        html = calibration_report(
+            calibration, observations=observations, poses=sequence, thumbnails=pictures, scan=matrices
+        )
+    else:
+        html = observations_report(observations)
+    write_report(target, html)
+    say.result({"out": target.name}, [f"{target}: written"])
+    return OK

@@ -1,0 +1,37 @@
+"""`tomopose simulate`: radiographs of a scene, with poses.csv, scanner.json and truth.json."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tomopose.cli.common import OK, ForceOption, JsonOption, QuietOption, Say, WorkersOption
+
+EPILOG = "Example: tomopose simulate scene.toml --out run/ --workers 2"
+
+
+def register(app: typer.Typer) -> None:
+    app.command("simulate", epilog=EPILOG)(simulate)
+
+
+def simulate(
+    scene: Annotated[Path, typer.Argument(help="scene.toml: source, detector, objects, mount, poses.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for radiographs/ and the tables.")],
+    workers: WorkersOption = 1,
+    resume: Annotated[bool, typer.Option("--resume", help="Keep the radiographs that are there already.")] = False,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """Make radiographs that can stand in for the scanner's.  The same scene and seed give the same bytes."""
+    import tomopose as tp
+    from tomopose.cli.simulated import write_run
+
+    say = Say(json=as_json, quiet=quiet)
+    run = tp.simulate(tp.read_scene(scene))
+    with say.progress("simulating") as progress:
+        write_run(out, run, inputs=[scene], workers=workers, resume=resume, force=force, progress=progress)
+    say.result({"out": out.name, "images": len(run)}, [f"{out}: {len(run)} radiographs, tables and truth.json"])
+    return OK
