@@ -1,0 +1,358 @@
+"""The report of a calibration: verdict first, then what was found, how well the data fit, and what they can tell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from tomopose.calibration.result import Calibration
+from tomopose.geometry.projection import ProjectionMatrices
+from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.poses import PoseSequence
+from tomopose.observations import BallObservations
+from tomopose.report import coverage_figures, residual_figures, scene_figures
+from tomopose.report.gather import Joined, join
+from tomopose.report.page import (
+    BAD,
+    CARE,
+    GOOD,
+    Block,
+    KeyFigure,
+    Page,
+    Pictures,
+    Section,
+    Table,
+    Verdict,
+    Words,
+    render,
+)
+from tomopose.report.provenance_section import provenance_section
+from tomopose.report.thumbnails import Thumbnail
+from tomopose.report.words import (
+    NOT_DETERMINABLE,
+    NOT_GIVEN,
+    cell,
+    heading,
+    meaning,
+    number,
+    small_unit,
+)
+from tomopose.units import value_with_uncertainty
+
+TONES: Mapping[str, Any] = {"trustworthy": GOOD, "doubtful": CARE, "rejected": BAD}
+COVERAGE_FACTOR = 2.0
+
+
+def calibration_report(
+    calibration: Calibration,
+    *,
+    observations: BallObservations | None,
+    poses: PoseSequence | None,
+    thumbnails: Sequence[Thumbnail] = (),
+    scan: ProjectionMatrices | None = None,
+    title: str = "Calibration report",
+) -> str:
+    """One offline HTML document about a calibration.
+
+    Parameters
+    ----------
+    calibration:  what is reported.
+    observations: all detections, those set aside too; gives normalised residuals their predicted uncertainty.
+    poses:        the pose table; without it the report knows no rotations, angles and scenes of poses.
+    thumbnails:   pictures of the worst detections, worst first (`worst_thumbnails` makes them).
+    scan:         matrices of a scan made with this calibration: adds the source's path and the expected effect.
+
+    Returns
+    -------
+    HTML text; it loads nothing from a network.  Parts that were not given are named as such.
+    """
+    joined = join(calibration, observations=observations, poses=poses)
+    n, left = len(calibration.pose_id), len(calibration.outliers)
+    sections = [
+        _parameters(calibration),
+        _residuals(calibration, joined),
+        _detections(calibration, joined, observations, thumbnails),
+        _observability(calibration),
+        _coverage(calibration, joined, observations),
+        _scene(calibration, joined, scan),
+        *_models(calibration),
+        provenance_section(calibration.provenance),
+    ]
+    page = Page(
+        title=title,
+        subtitle=f"{n} radiographs used, {left} set aside · model {calibration.model} · magnification "
+        f"{calibration.scanner.magnification:.3f} · pose convention {calibration.convention}",
+        verdict=_verdict(calibration),
+        key_figures=_key_figures(calibration, scan),
+        sections=sections,
+        footer="Written by tomopose. Uncertainties are standard uncertainties unless k = 2 is said. Equation and "
+        "figure numbers are those of Butzhammer, Müller and Hausotte, Meas. Sci. Technol. 34 (2023) 015403.",
+    )
+    return render(page)
+
+
+def _verdict(calibration: Calibration) -> Verdict:
+    sentence = calibration.status or "The solver gave no sentence about how it ended."
+    if not calibration.converged:
+        sentence = "Not converged. " + sentence
+    return Verdict(
+        word=calibration.verdict.capitalize(),
+        sentence=sentence,
+        tone=TONES[calibration.verdict],
+        reasons=calibration.reasons,
+    )
+
+
+def _key_figures(calibration: Calibration, scan: ProjectionMatrices | None) -> list[KeyFigure]:
+    chi2 = calibration.chi2_dof
+    keys = [
+        KeyFigure(name="Reprojection error d_rms", value=f"{calibration.d_rms:.4f} px", note="eq. (8)"),
+        KeyFigure(name="… at the object", value=f"{number(calibration.d_rms_um)} µm", note="pitch over magnification"),
+        KeyFigure(
+            name="χ² per degree of freedom",
+            value=number(chi2) if np.isfinite(chi2) else NOT_DETERMINABLE,
+            note=f"{calibration.dof} degrees; 1 where noise is all",
+        ),
+        KeyFigure(
+            name="Condition number",
+            value=number(calibration.observability.condition),
+            note=f"{len(calibration.observability.unobservable)} directions unobservable",
+        ),
+    ]
+    if scan is None or scan.points_sigma is None:
+        keys.append(KeyFigure(name="Expected effect on the scan", value=NOT_GIVEN, note="no scan given"))
+    else:
+        sigma = float(np.sqrt(np.nanmean(np.asarray(scan.points_sigma) ** 2)))
+        pitch = np.sqrt(scan.p_u * scan.p_v) * 1000.0 / calibration.scanner.magnification
+        keys.append(
+            KeyFigure(
+                name="Expected effect on the scan", value=f"{number(sigma)} px",
+                note=f"{number(sigma * pitch)} µm at the object, rms",
+            )
+        )
+    return keys
+
+
+def _parameters(calibration: Calibration) -> Section:
+    rows = []
+    for p in calibration.parameters:
+        degrees = f"{np.degrees(p.value):.6f}°" if p.unit == "rad" else ""
+        rows.append(
+            [p.name, meaning(p.name), value_with_uncertainty(p.value, p.u, p.unit), degrees, small_unit(p.u, p.unit),
+             small_unit(COVERAGE_FACTOR * p.u, p.unit)]
+        )
+    T_HT = calibration.T_HT
+    blocks: list[Block] = [
+        Table(
+            title="Parameters",
+            meaning="The figures in brackets are the standard uncertainty in units of the last digits; U is the "
+            "expanded uncertainty, k = 2.",
+            columns=["parameter", "what it is", "value", "in degrees", "u", "U (k = 2)"],
+            rows=rows,
+            numeric=(2, 3, 4, 5),
+        ),
+        _transform_table(T_HT, "T_HT: from the manipulator's base H to the table T"),
+        _transform_table(T_HT.inv, "T_TH: from the table T to the manipulator's base H"),
+    ]
+    if calibration.manipulator:
+        blocks.append(
+            Table(
+                title="Identified errors of the manipulator",
+                meaning="Numbers that the model found beside the mount.",
+                columns=["name", "value"],
+                rows=[[k, cell(v)] for k, v in calibration.manipulator.items()],
+                folded=len(calibration.manipulator) > 12,
+            )
+        )
+    pivot = NOT_GIVEN if calibration.pivot is None else ", ".join(f"{x:.4f}" for x in calibration.pivot) + " mm"
+    blocks.append(
+        Words(
+            items=[
+                f"Pivot of the controller: {pivot}. A scan with another pivot needs another calibration.",
+                "T_AB takes coordinates in A to coordinates in B. Angles are those of R = R_x R_y R_z.",
+            ]
+        )
+    )
+    return Section(title="What was found", lead="How the manipulator sits on the table, and where the ball is.",
+                   blocks=blocks)
+
+
+def _transform_table(T: RigidTransform, title: str) -> Table:
+    angles = ", ".join(f"{a:.5f}°" for a in np.degrees(T.angles))
+    return Table(
+        title=title,
+        meaning=f"Angles {angles}; t in mm.",
+        columns=["R", "", "", "t / mm"],
+        rows=[[*(f"{x:.9f}" for x in T.R[k]), f"{T.t[k]:.6f}"] for k in range(3)],
+        numeric=(0, 1, 2, 3),
+        wide=False,
+    )
+
+
+def _residuals(calibration: Calibration, joined: Joined) -> Section:
+    blocks: list[Block | None] = [
+        residual_figures.by_pose(joined),
+        residual_figures.quiver(calibration, joined),
+        residual_figures.rotation_table(calibration, joined),
+        residual_figures.over_sequence(joined),
+        residual_figures.by_coordinate(joined),
+        residual_figures.histogram(joined),
+        residual_figures.quantiles(joined),
+    ]
+    if joined.poses is None:
+        blocks.append(Words(paragraphs=[f"Residuals by rotation and by coordinate: {NOT_GIVEN} (no pose table)."]))
+    return Section(
+        title="How well the data fit",
+        lead=f"Reprojection error {calibration.d_rms:.4f} px, {number(calibration.d_rms_um)} µm at the object. A small "
+        "residual alone proves little: see what the poses can tell.",
+        blocks=[b for b in blocks if b is not None],
+    )
+
+
+def _detections(
+    calibration: Calibration, joined: Joined, observations: BallObservations | None, thumbnails: Sequence[Thumbnail]
+) -> Section:
+    blocks: list[Block] = []
+    if calibration.outliers:
+        blocks.append(
+            Table(
+                title="Set aside",
+                meaning="Images that do not take part in the result, and why.",
+                columns=["pose", "reason"],
+                rows=[[p, reason] for p, reason in calibration.outliers.items()],
+                wide=len(calibration.outliers) > 8,
+            )
+        )
+    else:
+        blocks.append(Words(title="Set aside", paragraphs=["No image was set aside as an outlier."]))
+    if thumbnails:
+        blocks.append(
+            Pictures(
+                title="Worst detections",
+                meaning="Crops of the radiographs, worst first, with the silhouette that was found (orange) and the "
+                "projection of the ball's centre (blue).",
+                look_for="The line should follow the ball's rim all round; where it does not, the image or the "
+                "detection is at fault, not the machine.",
+                thumbnails=thumbnails,
+            )
+        )
+    else:
+        blocks.append(Words(title="Worst detections", paragraphs=[f"Radiographs: {NOT_GIVEN}, so no pictures."]))
+    blocks.append(_pose_table(joined, observations))
+    return Section(title="Detections", lead="The images behind the numbers.", blocks=blocks)
+
+
+def _pose_table(joined: Joined, observations: BallObservations | None) -> Table:
+    snr: dict[str, float] = {}
+    if observations is not None and observations.snr is not None:
+        snr = dict(zip(observations.pose_id, map(float, observations.snr), strict=True))
+    rows = []
+    for k in np.argsort(-joined.d, kind="stable"):
+        pose = joined.pose_id[k]
+        rows.append(
+            [pose, joined.group[k] if joined.group else "–", f"{joined.x_D[k, 0]:.3f}", f"{joined.x_D[k, 1]:.3f}",
+             f"{joined.r[k, 0]:+.4f}", f"{joined.r[k, 1]:+.4f}", f"{joined.d[k]:.4f}",
+             f"{np.linalg.norm(joined.z[k]):.2f}", number(snr[pose]) if np.isfinite(snr.get(pose, np.nan)) else "–"]
+        )
+    return Table(
+        title="All poses used, worst first",
+        meaning="A click on a column's head sorts by it.",
+        columns=[
+            "pose", "rotation", "u / px", "v / px", "residual u / px", "residual v / px", "d / px", "d / σ", "SNR",
+        ],
+        rows=rows,
+        numeric=range(2, 9),
+        folded=True,
+    )
+
+
+def _observability(calibration: Calibration) -> Section:
+    seen = calibration.observability
+    blocks: list[Block] = []
+    if seen.unobservable:
+        blocks.append(Words(title="Directions that these poses cannot tell", items=seen.unobservable, wide=False))
+        lead = "Some directions of the parameters are not held by these poses."
+    else:
+        blocks.append(
+            Words(title="Directions that these poses cannot tell", paragraphs=["None among the parameters solved for."],
+                  wide=False)
+        )
+        lead = "All parameters solved for are held by these poses."
+    if seen.notes:
+        blocks.append(Words(title="What would help", items=seen.notes, wide=False))
+    else:
+        blocks.append(Words(title="What would help", paragraphs=["Nothing was proposed."], wide=False))
+    blocks += [coverage_figures.correlation_map(calibration), coverage_figures.singular_values(calibration)]
+    if calibration.hypotheses:
+        columns = list(dict.fromkeys(key for row in calibration.hypotheses for key in row))
+        blocks.append(
+            Table(
+                title="Rival conventions",
+                meaning="Other readings of the same data (orders, signs, flips, pairing), fitted the same way. One "
+                "that fits about as well cannot be told apart with these poses, and one of the two ruins the scan.",
+                columns=[heading(c) for c in columns],
+                rows=[[cell(row.get(c)) for c in columns] for row in calibration.hypotheses],
+            )
+        )
+    else:
+        blocks.append(Words(title="Rival conventions", paragraphs=[f"Hypotheses tried: {NOT_GIVEN}."]))
+    return Section(title="What the poses can tell", lead=lead, blocks=blocks)
+
+
+def _coverage(calibration: Calibration, joined: Joined, observations: BallObservations | None) -> Section:
+    blocks: list[Block | None] = [
+        coverage_figures.detector_map(calibration, joined, observations),
+        coverage_figures.table_angles(joined),
+        coverage_figures.rotation_map(joined),
+    ]
+    if joined.poses is None:
+        blocks.append(Words(paragraphs=[f"Rotations and table angles: {NOT_GIVEN} (no pose table)."], wide=False))
+    return Section(title="Coverage", lead="Where in the machine the model was tested.",
+                   blocks=[b for b in blocks if b is not None])
+
+
+def _scene(calibration: Calibration, joined: Joined, scan: ProjectionMatrices | None) -> Section:
+    blocks: list[Block | None] = [
+        scene_figures.scanner_scene(calibration, joined), scene_figures.ball_scene(calibration, joined)
+    ]
+    if scan is None:
+        words = f"Path of the source and expected effect: {NOT_GIVEN} (no scan)."
+        blocks.append(Words(title="Scan", paragraphs=[words], wide=False))
+    else:
+        blocks += [scene_figures.source_path(scan), coverage_figures.scan_effect(scan)]
+        if scan.points_sigma is None:
+            blocks.append(Words(paragraphs=[f"Expected effect on the scan: {NOT_DETERMINABLE}, the matrices hold no "
+                                            "uncertainty."]))
+    return Section(title="In space", lead="The geometry as calibrated; drag to turn, scroll to come nearer.",
+                   blocks=[b for b in blocks if b is not None])
+
+
+def _models(calibration: Calibration) -> list[Section]:
+    """Tables of what else the calibration holds, such as a comparison of models or held-out poses."""
+    blocks: list[Block] = []
+    for key, value in calibration.extra.items():
+        rows = _rows(value)
+        if rows:
+            columns = list(dict.fromkeys(c for row in rows for c in row))
+            blocks.append(
+                Table(
+                    title=heading(key).capitalize(), meaning="", columns=[heading(c) for c in columns],
+                    rows=[[cell(row.get(c)) for c in columns] for row in rows], folded=len(rows) > 20,
+                )
+            )
+    if not blocks:
+        return []
+    return [Section(title="Models and checks", lead="Further results of the same data.", blocks=blocks)]
+
+
+def _rows(value: Any) -> list[Mapping[str, Any]]:
+    """A nested value as the rows of a table."""
+    if isinstance(value, Mapping):
+        if value and all(isinstance(v, Mapping) for v in value.values()):
+            return [{"name": k, **v} for k, v in value.items()]
+        return [{"name": heading(str(k)), "value": v} for k, v in value.items()]
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [v if isinstance(v, Mapping) else {"value": v} for v in value]
+    return [{"value": value}]
