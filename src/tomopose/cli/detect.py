@@ -18,7 +18,7 @@ from tomopose.cli.common import (
     WorkersOption,
 )
 
-EPILOG = "Example: tomopose detect --scanner scanner.json --images radiographs/ --poses poses.csv --out observations.csv"
+EPILOG = "Example: tomopose detect --scanner scanner.json --images 'run/*.tif' --poses poses.csv --out observations.csv"
 
 ImagesOption = Annotated[str, typer.Option("--images", help="Folder, glob or multi-page file of radiographs.")]
 

@@ -6,6 +6,7 @@ import importlib.util
 import os
 import platform
 import shutil
+from typing import Any
 
 import typer
 
@@ -32,7 +33,7 @@ def doctor(as_json: JsonOption = False, quiet: QuietOption = False) -> int:
     """Say which engines and extras are found, their versions, and how to install what is missing."""
     from tomopose.provenance import package_version
 
-    extras = {
+    extras: dict[str, dict[str, Any]] = {
         extra: {
             "packages": {name: package_version(name) for name in packages},
             "complete": all(package_version(name) != "not installed" for name in packages),
@@ -40,7 +41,14 @@ def doctor(as_json: JsonOption = False, quiet: QuietOption = False) -> int:
         }
         for extra, packages in EXTRAS.items()
     }
+    rtk = package_version("itk-rtk") != "not installed"
     cuda = importlib.util.find_spec("astra") is not None and shutil.which("nvidia-smi") is not None
+    engines = {
+        "cpu": "available",
+        "reference": "available",
+        "rtk": "available" if rtk else 'pip install "tomopose[recon]"',
+        "astra": "available" if cuda else 'needs a CUDA device and pip install "tomopose[gpu]"',
+    }
     summary = {
         "tomopose": package_version(),
         "python": platform.python_version(),
@@ -48,18 +56,13 @@ def doctor(as_json: JsonOption = False, quiet: QuietOption = False) -> int:
         "processors": os.cpu_count(),
         "core": {name: package_version(name) for name in CORE},
         "extras": extras,
-        "engines": {
-            "cpu": "available",
-            "reference": "available",
-            "rtk": "available" if package_version("itk-rtk") != "not installed" else 'pip install "tomopose[recon]"',
-            "astra": "available" if cuda else 'needs a CUDA device and pip install "tomopose[gpu]"',
-        },
+        "engines": engines,
         "browser": next((b for b in BROWSERS if shutil.which(b)), None),
     }
     lines = [f"tomopose {package_version()}, Python {platform.python_version()}, {os.cpu_count()} processors"]
     for extra, found in extras.items():
         state = "complete" if found["complete"] else f"incomplete; {found['install']}"
-        lines.append(f"  [{extra}] {state}: " + ", ".join(f"{k} {v}" for k, v in found["packages"].items()))  # type: ignore[attr-defined]
-    lines += [f"  engine {name}: {state}" for name, state in summary["engines"].items()]  # type: ignore[attr-defined]
+        lines.append(f"  [{extra}] {state}: " + ", ".join(f"{k} {v}" for k, v in found["packages"].items()))
+    lines += [f"  engine {name}: {state}" for name, state in engines.items()]
     Say(json=as_json, quiet=quiet).result(summary, lines)
     return OK

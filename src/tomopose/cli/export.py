@@ -44,7 +44,7 @@ def export(
         tp.read_matrices(matrices), out, formats="all" if to == "all" else names(to), rows=order, force=force
     )
     say.result(
-        {"out": out.name, "written": list(written.written), "refused": dict(written.refused)},
-        [f"{out}: {', '.join(written.written)}", *(f"refused {k}: {v}" for k, v in written.refused.items())],
+        {"out": out.name, "files": dict(written.files), "refused": dict(written.refused)},
+        [f"{out}: {', '.join(written.files)}", *(f"refused {k}: {v}" for k, v in written.refused.items())],
     )
     return OK

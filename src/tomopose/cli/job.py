@@ -53,7 +53,8 @@ def executor_of(dask: str | None) -> Iterator[Any]:
         from tomopose.errors import EngineMissingError
 
         raise EngineMissingError("dask is not installed", install_line='pip install "tomopose[dask]"') from error
-    with Client(dask) as client:
+    make_client: Any = Client
+    with make_client(dask) as client:
         yield client
 
 

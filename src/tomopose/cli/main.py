@@ -11,9 +11,8 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
-import click
 import typer
 
 from tomopose.cli.common import BAD_INPUT, INTERNAL, MISSING, OK, USAGE
@@ -31,6 +30,9 @@ VERBS = (
     "doctor",
 )
 """The modules of this folder that hold a verb each, in the order of --help; each has `register(app)`."""
+
+# typer brings its own copy of click, or uses an installed one, by version: its exceptions are reached through typer.
+CommandLineError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
 app = typer.Typer(
     name="tomopose",
@@ -86,13 +88,10 @@ def run(argv: Sequence[str] | None = None) -> int:
     try:
         code = typer.main.get_command(app).main(args=words, prog_name="tomopose", standalone_mode=False)
         return code if isinstance(code, int) else OK
-    except click.exceptions.NoArgsIsHelpError as error:
+    except CommandLineError as error:
         error.show()
         return USAGE
-    except click.ClickException as error:
-        error.show()
-        return USAGE
-    except (click.exceptions.Abort, KeyboardInterrupt):
+    except (typer.Abort, KeyboardInterrupt):
         print("tomopose: interrupted; no partial file was left", file=sys.stderr)
         return 130
     except EngineMissingError as error:

@@ -20,7 +20,7 @@ def report(
     folder: Annotated[Path, typer.Argument(help="Folder with calibration.json or observations.csv.")],
     poses: Annotated[Path | None, typer.Option("--poses", help="poses.csv, for the plots by axis and angle.")] = None,
     images: Annotated[str | None, typer.Option("--images", help="Radiographs, for pictures of detections.")] = None,
-    scan: Annotated[Path | None, typer.Option("--scan", help="matrices.npz of a scan, for its expected effect.")] = None,
+    scan: Annotated[Path | None, typer.Option("--scan", help="matrices.npz of a scan, for its effect.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="The HTML file; default report.html in the folder.")] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -36,8 +36,6 @@ def report(
     say = Say(json=as_json, quiet=quiet)
     target = require_absent(out or folder / "report.html", force=force)
     calibration_file, observations_file = folder / "calibration.json", folder / "observations.csv"
-    if not calibration_file.exists() and not observations_file.exists():
-        raise FileError(f"{folder} holds neither calibration.json nor observations.csv", path=folder)
     observations = tp.read_observations(observations_file) if observations_file.exists() else None
     sequence = None if poses is None else tp.read_poses(poses)
     calibration = tp.read_calibration(calibration_file) if calibration_file.exists() else None
@@ -51,8 +49,10 @@ def report(
         html = calibration_report(
             calibration, observations=observations, poses=sequence, thumbnails=pictures, scan=matrices
         )
-    else:
+    elif observations is not None:
         html = observations_report(observations)
+    else:
+        raise FileError(f"{folder} holds neither calibration.json nor observations.csv", path=folder)
     write_report(target, html)
     say.result({"out": target.name}, [f"{target}: written"])
     return OK
