@@ -11,7 +11,7 @@ from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
 from tomopose.trajectory.completeness import object_points, plane_normals, source_path, tuy_completeness
 from tomopose.trajectory.scan import circular_scan, tilted_scan
-from tomopose.trajectory.tilt import triangle_tilt
+from tomopose.trajectory.tilt import eq11_triangle
 
 
 def circle(radius: float, n: int = 720) -> np.ndarray:
@@ -38,7 +38,7 @@ def test_two_circles_at_right_angles_are_complete():
 def test_the_tilted_scan_is_more_complete_than_the_circular_one(scanner, T_HT):
     points = object_points(15, -15, 15, spacing=5)
     result = []
-    for poses in (circular_scan(140), tilted_scan(140, triangle_tilt, R_HT=T_HT.R)):
+    for poses in (circular_scan(140), tilted_scan(140, eq11_triangle, R_HT=T_HT.R)):
         P = eq5_matrices(scanner, T_HT=T_HT, T_MH=poses.T_MH, alpha=poses.alpha)
         result.append(tuy_completeness(source_path(P), points))
     circular, tilted = result

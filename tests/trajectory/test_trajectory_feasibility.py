@@ -24,7 +24,7 @@ from tomopose.trajectory.feasibility import (
 )
 from tomopose.trajectory.pose_grid import pose_grid
 from tomopose.trajectory.scan import circular_scan, tilted_scan
-from tomopose.trajectory.tilt import triangle_tilt
+from tomopose.trajectory.tilt import eq11_triangle
 
 
 def test_travel_limits_name_the_worst_pose_and_axis():
@@ -51,7 +51,7 @@ def test_bad_limits_are_refused():
 
 
 def test_the_cylinder_in_view_holds_the_true_one(scanner, T_HT):
-    poses = tilted_scan(11, triangle_tilt, R_HT=T_HT.R)
+    poses = tilted_scan(11, eq11_triangle, R_HT=T_HT.R)
     P = eq5_matrices(scanner, T_HT=T_HT, T_MH=poses.T_MH, alpha=poses.alpha)
     corners = project(P, cylinder(20, -15, 25, corners=32))
     phi = np.linspace(0, 2 * np.pi, 400)

@@ -12,7 +12,7 @@ from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.trajectory.tilt import R_HT_MOUNTED, hexapod_rotation
+from tomopose.trajectory.tilt import R_HT_MOUNTED, eq10_rotation
 from tomopose.units import Array
 
 Wave = Callable[[Array], Array]
@@ -66,7 +66,7 @@ def tilted_scan(
 ) -> PoseSequence:
     """A turn of the table while the object is tilted about y_W by tilt(alpha), rad.  Eq. (10).
 
-    tilt: any function of the table angles (n,): `triangle_tilt` (eq. 11), `sine_tilt`, or your own.
+    tilt: any function of the table angles (n,): `eq11_triangle` (eq. 11), `sine_tilt`, or your own.
     R_HT: from a calibration (`cal.T_HT.R`), or the paper's R_z(pi).
     The positions stay at zero, as in the paper.
     """
@@ -77,4 +77,4 @@ def tilted_scan(
     if not np.isfinite(phi_tilt).all():
         k = int(np.flatnonzero(~np.isfinite(phi_tilt))[0])
         raise InputError(f"the tilt at table angle {alpha[k]:g} rad (view {k}) is not finite")
-    return scan(alpha, hexapod_rotation(alpha, phi_tilt, R_HT), pivot=pivot)
+    return scan(alpha, eq10_rotation(alpha, phi_tilt, R_HT), pivot=pivot)

@@ -15,7 +15,7 @@ R_HT_MOUNTED = R_z(math.pi)
 R_HT_MOUNTED.setflags(write=False)
 
 
-def hexapod_rotation(alpha: Array, phi_tilt: Array, R_HT: Array = R_HT_MOUNTED) -> Array:
+def eq10_rotation(alpha: Array, phi_tilt: Array, R_HT: Array = R_HT_MOUNTED) -> Array:
     """R_MH,j (n, 3, 3) = R_HT^-1 R_TW,j^-1 R_y(phi_tilt,j) R_TW,j R_HT.  Eq. (10).
 
     alpha: table angles (n,), rad; phi_tilt: wanted tilt about y_W (n,), rad; R_HT: (3, 3), of a calibration, or the
@@ -29,7 +29,7 @@ def hexapod_rotation(alpha: Array, phi_tilt: Array, R_HT: Array = R_HT_MOUNTED) 
     return np.swapaxes(R_TH, -1, -2) @ R_y(phi_tilt) @ R_TH
 
 
-def triangle_tilt(alpha: Array) -> Array:
+def eq11_triangle(alpha: Array) -> Array:
     """phi_tilt,j (n,), rad: amplitude 8 deg, phase 90 deg, seven periods a turn.  Eq. (11), as printed."""
     alpha = np.asarray(alpha, dtype=np.float64)
     return 28 / 45 * np.abs(np.mod(alpha + math.pi / 14, 2 * math.pi / 7) - math.pi / 7) - 2 * math.pi / 45
