@@ -23,6 +23,7 @@ VERBS = (
     "simulate",
     "detect",
     "calibrate",
+    "plan",
     "matrices",
     "export",
     "import_geometry",

@@ -65,7 +65,7 @@ def angles_from_rotation(R: Array) -> Array:
     locked = cos_b < GIMBAL_COSINE
     a = np.where(locked, np.arctan2(R[..., 2, 1], R[..., 1, 1]), np.arctan2(-R[..., 1, 2], R[..., 2, 2]))
     c = np.where(locked, 0.0, np.arctan2(-R[..., 0, 1], R[..., 0, 0]))
-    return np.stack([a, b, c], axis=-1)
+    return np.stack([a, b, c], axis=-1) + 0.0  # without minus zeros, which would reach files
 
 
 def exp_rotation(w: Array) -> Array:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -54,13 +53,13 @@ def demo_setup(*, grid: int = 2, views: int = 180, small: bool = False) -> DemoS
     from tomopose.trajectory.scan import tilted_scan
     from tomopose.trajectory.tilt import eq11_triangle
 
-    T_HT = RigidTransform.from_angles([0.0071, 0.0048, np.pi - 0.0155], [-1.9, 2.6, 1.4], source=Frame.H, target=Frame.T)
+    angles, t_HT = [0.0071, 0.0048, np.pi - 0.0155], [-1.9, 2.6, 1.4]
+    T_HT = RigidTransform.from_angles(angles, t_HT, source=Frame.H, target=Frame.T)
     scanner = paper_scanner()
-    wave: Callable[[Array], Array] = eq11_triangle
     return DemoSetup(
-        scanner=scanner.binned(SMALL_BINNING) if small else replace(scanner),
+        scanner=scanner.binned(SMALL_BINNING) if small else scanner,
         T_HT=T_HT,
         t=np.array([-0.85, 0.55, -0.65]),
         poses=pose_grid(grid),
-        scan=tilted_scan(views, tilt=wave, R_HT=T_HT.R),
+        scan=tilted_scan(views, eq11_triangle, R_HT=T_HT.R),
     )
