@@ -121,7 +121,8 @@ def third_party(shared: Path) -> None:
     off = (cal.T_HT.t - truth["T_HT"]["t_mm"]) * 1e3
     R = tp.RigidTransform.from_angles(truth["T_HT"]["phi_rad"], [0, 0, 0], source=Frame.H, target=Frame.T).R
     turned = 1e6 * rotation_angle_between(R, cal.T_HT.R)
-    row("third-party images, T_HT", f"t_HT {off.round(2)} um", f"R {turned:.2f} urad", f"d_rms {cal.d_rms:.5f} px", f"chi2/dof {cal.chi2_dof:.2f}", cal.verdict)
+    row("third-party images, T_HT", f"t_HT {off.round(2)} um", f"R {turned:.2f} urad",
+        f"d_rms {cal.d_rms:.5f} px", f"chi2/dof {cal.chi2_dof:.2f}", cal.verdict)
     words = ["--scanner", folder / "scanner.json", "--poses", folder / "poses.csv", "--images", folder / "radiographs"]
     for attempt in ("first (kernels compiled where not cached)", "second"):
         with tempfile.TemporaryDirectory() as out:
