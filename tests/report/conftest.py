@@ -45,7 +45,7 @@ def sample() -> Callable[..., tuple[Calibration, BallObservations, PoseSequence]
         T_HT = RigidTransform.from_angles([0.02, -0.03, 3.05], [2.0, -1.5, 4.0], source=Frame.H, target=Frame.T)
         poses = grid_poses(turns)
         exact = predicted(scanner, T_HT, poses, np.zeros(9))
-        noise = np.random.default_rng(7).normal(scale=NOISE_PX, size=exact.shape)
+        noise = np.random.default_rng(20231028).normal(scale=NOISE_PX, size=exact.shape)
         seen = np.ones(len(poses), dtype=bool)
         seen[-outliers:] = outliers == 0
         observations = BallObservations.from_sigma(
@@ -88,12 +88,16 @@ def sample() -> Callable[..., tuple[Calibration, BallObservations, PoseSequence]
             verdict=verdict,
             reasons=("the residuals are explained by the stated detection noise", "no rival convention fits as well"),
             hypotheses=(
-                {"name": "as given", "d_rms_px": 0.0283, "delta_chi2": 0.0, "verdict": "best"},
-                {"name": "order R_z R_y R_x", "d_rms_px": 0.0283, "delta_chi2": 0.4, "verdict": "cannot be told apart"},
-                {"name": "image rows flipped", "d_rms_px": 4.61, "delta_chi2": 9.1e6, "verdict": "excluded"},
+                {"name": "declared", "words": "the data as declared", "cure": "", "d_rms_px": 0.0283,
+                 "delta_chi2": 0.0, "outcome": "declared", "verdict": "as declared"},
+                {"name": "zyx", "words": "order R_z R_y R_x", "cure": "# convention: symetrie-hexapod",
+                 "d_rms_px": 0.0283, "delta_chi2": 0.4, "outcome": "same",
+                 "verdict": "cannot be told apart with these poses"},
+                {"name": "rows", "words": "image rows flipped", "cure": "image_rows: bottom-first", "d_rms_px": 4.61,
+                 "delta_chi2": 9.1e6, "outcome": "worse", "verdict": "excluded"},
             ),
             pivot=np.array([0.0, 0.0, 200.0]),
-            provenance=provenance(arguments={"model": "rigid"}, seed=7),
+            provenance=provenance(arguments={"model": "rigid"}, seed=20231028),
         )
         return calibration, observations, poses
 

@@ -43,6 +43,7 @@ from tomopose.units import value_with_uncertainty
 
 TONES: Mapping[str, Any] = {"trustworthy": GOOD, "doubtful": CARE, "rejected": BAD}
 COVERAGE_FACTOR = 2.0
+HYPOTHESIS_COLUMNS = ("words", "name", "verdict", "d_rms_px", "delta_chi2", "cure")
 
 
 def calibration_report(
@@ -285,20 +286,36 @@ def _observability(calibration: Calibration) -> Section:
     else:
         blocks.append(Words(title="What would help", paragraphs=["Nothing was proposed."], wide=False))
     blocks += [coverage_figures.correlation_map(calibration), coverage_figures.singular_values(calibration)]
-    if calibration.hypotheses:
-        columns = list(dict.fromkeys(key for row in calibration.hypotheses for key in row))
-        blocks.append(
-            Table(
-                title="Rival conventions",
-                meaning="Other readings of the same data (orders, signs, flips, pairing), fitted the same way. One "
-                "that fits about as well cannot be told apart with these poses, and one of the two ruins the scan.",
-                columns=[heading(c) for c in columns],
-                rows=[[cell(row.get(c)) for c in columns] for row in calibration.hypotheses],
-            )
-        )
-    else:
-        blocks.append(Words(title="Rival conventions", paragraphs=[f"Hypotheses tried: {NOT_GIVEN}."]))
+    blocks += _hypotheses(calibration.hypotheses)
     return Section(title="What the poses can tell", lead=lead, blocks=blocks)
+
+
+def _hypotheses(hypotheses: Sequence[Mapping[str, Any]]) -> list[Block]:
+    """Rivals that are still possible, open to view; those that the data exclude, folded away."""
+    if not hypotheses:
+        return [Words(title="Rival conventions", paragraphs=[f"Hypotheses tried: {NOT_GIVEN}."])]
+    present = {key for row in hypotheses for key in row}
+    columns = [c for c in HYPOTHESIS_COLUMNS if c in present] or sorted(present)
+    excluded = [row for row in hypotheses if row.get("verdict") == "excluded"]
+    possible = [row for row in hypotheses if row.get("verdict") != "excluded"]
+    tables = []
+    for title, rows, words in (
+        (
+            "Rival conventions",
+            possible,
+            "Other readings of the same data (orders, signs, flips, pairing), fitted the same way. One that fits about "
+            "as well cannot be told apart with these poses, and one of the two ruins the scan.",
+        ),
+        ("Rival conventions that the data exclude", excluded, "They fit significantly worse."),
+    ):
+        if rows:
+            tables.append(
+                Table(
+                    title=title, meaning=words, columns=[heading(c) for c in columns],
+                    rows=[[cell(row.get(c)) for c in columns] for row in rows], folded=rows is excluded,
+                )
+            )
+    return list(tables)
 
 
 def _coverage(calibration: Calibration, joined: Joined, observations: BallObservations | None) -> Section:

@@ -69,7 +69,10 @@ def detector_map(calibration: Calibration, joined: Joined, observations: BallObs
         look_for="The projections should reach as far out as the object of the scan will; the model is not tested "
         "where there are no points.",
         data=data,
-        layout=layout(xaxis=axis("u / px"), yaxis=axis("v / px", scaleanchor="x", scaleratio=1)),
+        layout=layout(
+            xaxis=axis("u / px", constrain="domain"),
+            yaxis=axis("v / px", scaleanchor="x", scaleratio=1, constrain="domain"),
+        ),
         height=440,
         wide=False,
     )
@@ -194,7 +197,9 @@ def singular_values(calibration: Calibration) -> Figure:
                 "marker": {"color": ACCENT}, "hovertemplate": "%{y:.4g}<extra></extra>",
             }
         ],
-        layout=layout(xaxis=axis("direction", type="category"), yaxis=axis("singular value", type="log"), bargap=0.45),
+        layout=layout(
+            xaxis=axis("direction", type="category"), yaxis=axis("singular value", type="log", dtick="D2"), bargap=0.45
+        ),
         height=440,
         wide=False,
     )
@@ -222,7 +227,6 @@ def scan_effect(scan: ProjectionMatrices) -> Figure | None:
         meaning="Standard uncertainty with which this calibration predicts the pixels of object points, by view.",
         look_for="It should stay well below half a pixel; peaks mark poses outside of the range that was calibrated.",
         data=traces,
-        layout=layout(xaxis=axis("view"), yaxis=axis("u / px", rangemode="tozero")),
-        height=460,
-        wide=False,
+        layout=layout(xaxis=axis("view"), yaxis=axis("σ / px", rangemode="tozero")),
+        height=330,
     )

@@ -121,7 +121,11 @@ def _positions(observations: BallObservations) -> Figure:
                 "hovertemplate": "pose %{text}<br>%{x:.2f}, %{y:.2f} px<extra></extra>",
             }
         ],
-        layout=layout(xaxis=axis("u / px"), yaxis=axis("v / px", scaleanchor="x", scaleratio=1), showlegend=False),
+        layout=layout(
+            xaxis=axis("u / px", constrain="domain"),
+            yaxis=axis("v / px", scaleanchor="x", scaleratio=1, constrain="domain"),
+            showlegend=False,
+        ),
         height=430,
         wide=False,
     )

@@ -67,10 +67,12 @@ def quiver(calibration: Calibration, joined: Joined) -> Figure:
         "error of the geometry (roll, tilt, distance) or of the manipulator.",
         data=data,
         layout=layout(
-            xaxis=axis("u / px"), yaxis=axis("v / px", scaleanchor="x", scaleratio=1), showlegend=False,
+            xaxis=axis("u / px", constrain="domain"),
+            yaxis=axis("v / px", scaleanchor="x", scaleratio=1, constrain="domain"),
+            showlegend=False,
             margin={"l": 62, "r": 20, "t": 12, "b": 48},
         ),
-        height=560,
+        height=470,
         wide=False,
     )
 
@@ -212,8 +214,7 @@ def rotation_table(calibration: Calibration, joined: Joined) -> Table | None:
     return Table(
         title="Residuals by rotation axis",
         meaning="The paper's question of sec. 5.2: which rotations carry the error?",
-        columns=["rotation", "poses", "d_rms / px", "at the object / µm", "largest d / px", "mean u / px",
-                 "mean v / px"],
+        columns=["rotation", "poses", "d_rms / px", "at object / µm", "largest", "mean u", "mean v"],
         rows=rows,
         numeric=range(1, 7),
         wide=False,

@@ -17,7 +17,8 @@ from tomopose.report.style import ACCENT, ALERT, ORANGE, SEQUENTIAL, SOFT, colou
 from tomopose.units import Array
 
 AXIS_COLOURS = ("#b2433f", "#2b7d4f", "#1f5f99")
-CAMERA = {"eye": {"x": 0.9, "y": -1.5, "z": 0.75}, "projection": {"type": "orthographic"}}
+CAMERA = {"eye": {"x": 1.1, "y": -1.9, "z": 0.9}, "center": {"x": 0, "y": 0, "z": -0.12}}
+NEAR_CAMERA = {"eye": {"x": 0.3, "y": -1.55, "z": 0.55}, "center": {"x": 0, "y": 0, "z": -0.04}}
 
 
 def _line(points: Any, colour: str, name: str = "", *, width: float = 3, dash: str = "solid") -> dict[str, Any]:
@@ -107,7 +108,7 @@ def scanner_scene(calibration: Calibration, joined: Joined) -> Figure:
         meaning="Source, beam, detector, table axis and the manipulator's frame H in the world frame W, as calibrated.",
         look_for="The manipulator's axes should stand as it is mounted, and the ball should lie in the beam.",
         data=data,
-        layout=_scene(),
+        layout=_scene(camera=NEAR_CAMERA, yaxis=space_axis("y / mm", nticks=3), zaxis=space_axis("z / mm", nticks=4)),
         height=430,
     )
 
@@ -160,7 +161,7 @@ def source_path(scan: ProjectionMatrices) -> Figure:
             _line(circle, ALERT, "circular scan", width=3),
             *_triad(RigidTransform.identity(Frame.W), 0.3 * radius, "W"),
         ],
-        layout=_scene(aspectmode="manual", aspectratio={"x": 1, "y": 1, "z": 0.6}),
+        layout=_scene(aspectmode="manual", aspectratio={"x": 1.25, "y": 1.25, "z": 0.75}),
         height=460,
         wide=False,
     )

@@ -53,6 +53,7 @@ def layout(**changes: Any) -> dict[str, Any]:
         "plot_bgcolor": "#ffffff",
         "margin": {"l": 58, "r": 20, "t": 34, "b": 48},
         "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom", "font": {"size": 12}},
+        "modebar": {"bgcolor": "rgba(255,255,255,0.85)", "color": "#aab4c0", "activecolor": ACCENT},
         "hoverlabel": {"font": {"family": FONT, "size": 12.5}},
         "xaxis": axis(),
         "yaxis": axis(),

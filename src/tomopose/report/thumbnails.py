@@ -156,7 +156,8 @@ def thumbnail_svg(thumbnail: Thumbnail) -> str:
     stroke = max(covered_u, covered_v) / 160.0
     parts = [
         f'<svg viewBox="0 0 {covered_u} {covered_v}" role="img" aria-label="radiograph of pose">',
-        f'<image href="{data_uri(grey_png(np.ascontiguousarray(rows)))}" width="{covered_u}" height="{covered_v}"/>',
+        f'<image href="{data_uri(grey_png(rows))}" width="{covered_u}" height="{covered_v}" '
+        'preserveAspectRatio="none"/>',
     ]
     if len(thumbnail.outline):
         parts.append(f'<path class="outline" d="{_path(place(thumbnail.outline))}" stroke-width="{stroke:.2f}"/>')

@@ -36,6 +36,9 @@ MEANINGS: Mapping[str, str] = MappingProxyType(
         "scale": "scale of the manipulator's translations",
     }
 )
+HEADINGS: Mapping[str, str] = MappingProxyType(
+    {"delta_chi2": "Δχ²", "words": "reading of the data", "cure": "to try it", "d_rms_px": "d_rms / px"}
+)
 GREEK = (("phi_", "φ_"), ("w_", "ω_"), ("eta", "η"), ("theta", "θ"), ("phi", "φ"))
 AXIS_NAME = re.compile(r"(?P<stem>phi_HT|w_HT|t_HT|t)(?:\[(?P<ball>-?\d+)\])?_(?P<axis>[xyz])")
 
@@ -98,6 +101,8 @@ def cell(value: Any) -> str:
 
 def heading(key: str) -> str:
     """A key of a result as a column's head: `delta_chi2` becomes `delta chi2`, `d_px` becomes `d / px`."""
+    if key in HEADINGS:
+        return HEADINGS[key]
     for unit, shown in (("_px", "px"), ("_um", "µm"), ("_mm", "mm"), ("_rad", "rad"), ("_deg", "°")):
         if key.endswith(unit) and len(key) > len(unit):
             return f"{key.removesuffix(unit).replace('_', ' ')} / {shown}"

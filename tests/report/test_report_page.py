@@ -1,0 +1,212 @@
+"""The report as a document: offline, escaped, complete, with figures that plotly accepts."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import plotly.graph_objects as go
+import pytest
+
+from tomopose.errors import FileError, ShapeError
+from tomopose.report import calibration_report, matrices_report, observations_report, write_report
+from tomopose.report.page import Page, Section, Table, plotly_script, render, script_json
+
+LOADING_ATTRIBUTES = {"src", "href", "srcset", "data", "poster", "action", "xlink:href"}
+
+
+class _Addresses(HTMLParser):
+    """Every address in an attribute that a browser could load or follow."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+        self.policy = ""
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.found += [v for k, v in attrs if k in LOADING_ATTRIBUTES and v]
+        if values.get("http-equiv") == "Content-Security-Policy":
+            self.policy = values["content"]
+
+
+def addresses(html: str) -> _Addresses:
+    parser = _Addresses()
+    parser.feed(html)
+    return parser
+
+
+def figures_of(html: str) -> dict:
+    return json.loads(re.search(r'id="figures">(.*?)</script>', html, re.S)[1])
+
+
+@pytest.fixture(scope="module")
+def full(sample, scan):
+    calibration, observations, poses = sample()
+    return calibration_report(calibration, observations=observations, poses=poses, scan=scan)
+
+
+def test_a_report_loads_nothing_from_elsewhere(full):
+    parser = addresses(full)
+    assert parser.found
+    assert all(a.startswith(("#", "data:image/png;base64,")) for a in parser.found)
+    assert "default-src 'none'" in parser.policy
+    assert "http" not in parser.policy
+    style = re.search(r"<style>(.*?)</style>", full, re.S)[1]
+    assert "url(" not in style
+    assert "@import" not in style
+
+
+def test_plotly_is_embedded_once(full):
+    assert full.count(plotly_script()[:2000]) == 1
+    assert "</script" not in plotly_script()
+
+
+def test_every_figure_is_valid_and_has_a_place(full):
+    figures = figures_of(full)
+    assert len(figures) == 15
+    for name, figure in figures.items():
+        assert f'<div class="plot" id="{name}"' in full
+        assert go.Figure(figure).data  # raises on a property that plotly does not know
+
+
+def test_every_figure_says_what_it_means_and_what_to_look_for(full):
+    captions = re.findall(r"<figcaption>(.*?)</figcaption>", full, re.S)
+    assert len(captions) == 15
+    for caption in captions:
+        meaning, look_for = re.fullmatch(r"(.+?) <em>(.+?)</em>", caption.strip(), re.S).groups()
+        assert meaning.endswith(".")
+        assert look_for.endswith(".")
+
+
+def test_the_verdict_comes_first_with_its_reasons(full, sample):
+    calibration, _, _ = sample()
+    verdict = full.index('class="verdict good"')
+    assert verdict < full.index("<section")
+    for reason in calibration.reasons:
+        assert verdict < full.index(reason) < full.index("<section")
+
+
+@pytest.mark.parametrize(("verdict", "tone"), [("doubtful", "care"), ("rejected", "bad")])
+def test_other_verdicts_have_another_tone(sample, verdict, tone):
+    calibration, observations, poses = sample(verdict=verdict)
+    html = calibration_report(calibration, observations=observations, poses=poses)
+    assert f'class="verdict {tone}"' in html
+
+
+def test_numbers_in_the_page_are_those_of_the_calibration(full, sample):
+    calibration, _, _ = sample()
+    assert f"{calibration.d_rms:.4f} px" in full
+    phi = calibration.parameters[0]
+    assert f"{phi.u * 1e6:.2f} µrad" in full
+    assert f"{2 * phi.u * 1e6:.2f} µrad" in full
+    for T in (calibration.T_HT, calibration.T_HT.inv):
+        assert f"<td class=\"n\">{T.R[0, 1]:.9f}</td>" in full
+        assert f"<td class=\"n\">{T.t[2]:.6f}</td>" in full
+    for pose in calibration.outliers:
+        assert f"<td>{pose}</td>" in full
+
+
+def test_a_bare_calibration_says_what_was_not_given(sample):
+    calibration, _, _ = sample(turns=(0.0,))
+    bare = dataclasses.replace(calibration, provenance=None, hypotheses=(), pivot=None, outliers={}, reasons=())
+    html = calibration_report(bare, observations=None, poses=None)
+    for words in (
+        "Provenance: not given", "Hypotheses tried: not given", "not given (no pose table)", "not given (no scan)",
+        "Radiographs: not given", "Pivot of the controller: not given", "No image was set aside", "their own rms",
+    ):
+        assert words in html, words
+    assert "t_HT,x and d_SR are exactly degenerate" in html
+    assert len(figures_of(html)) == 9
+
+
+def test_parameters_without_uncertainty_are_not_determinable(sample):
+    calibration, observations, poses = sample()
+    blind = tuple(dataclasses.replace(p, u=float("nan")) for p in calibration.parameters)
+    html = calibration_report(
+        dataclasses.replace(calibration, parameters=blind, dof=0), observations=observations, poses=poses
+    )
+    assert html.count("not determinable") >= 3 * len(blind)
+    shown = re.sub(r"<script.*?</script>", "", html, flags=re.S)
+    assert not re.search(r"\b(nan|inf)\b", shown, re.I)
+
+
+def test_names_cannot_break_out_of_the_page(sample):
+    calibration, observations, poses = sample()
+    evil = "</script><script>alert(1)</script>"
+    ids = (evil, *calibration.pose_id[1:])
+    html = calibration_report(
+        dataclasses.replace(calibration, pose_id=ids), observations=observations, poses=poses, title=evil
+    )
+    assert "<script>alert(1)" not in html
+    assert evil in figures_of(html)["figure-0"]["data"][0]["text"]
+
+
+def test_script_json_keeps_values_and_hides_tags():
+    text = script_json({"a": "<b>\u2028", "x": np.array([1.0, np.nan])})
+    assert "<" not in text
+    assert "\u2028" not in text
+    assert json.loads(text) == {"a": "<b>\u2028", "x": [1.0, None]}
+
+
+def test_a_page_without_figures_carries_no_plotting_script():
+    table = Table(title="T", meaning="", columns=["a"], rows=[["1"]])
+    html = render(Page(title="small", sections=[Section(title="S", blocks=[table])]))
+    assert len(html) < 20_000
+    assert "Plotly.newPlot" in html  # the page's own script stays the same; it finds no figures
+
+
+def test_the_same_values_give_the_same_page(sample):
+    calibration, observations, poses = sample()
+    first = calibration_report(calibration, observations=observations, poses=poses)
+    assert calibration_report(calibration, observations=observations, poses=poses) == first
+
+
+def test_extra_results_become_tables(sample):
+    calibration, observations, poses = sample()
+    extra = {"models": [{"model": "rigid", "d_rms_px": 0.495}, {"model": "kinematic", "d_rms_px": 0.031}],
+             "cross_validation": {"folds": 5, "held_out_px": 0.0321}, "not_seen": {}}
+    html = calibration_report(dataclasses.replace(calibration, extra=extra), observations=observations, poses=poses)
+    assert "Models and checks" in html
+    assert "kinematic" in html
+    assert "0.0321" in html
+
+
+def test_observations_report_counts_and_names_what_is_lost(sample):
+    _, observations, _ = sample()
+    html = observations_report(observations)
+    n = len(observations)
+    assert f"The ball was measured in {n - 2} of {n} images." in html
+    assert html.count("ball truncated by the image border") == 4  # among those not used, and in the table of all
+    assert len(figures_of(html)) == 2
+    nothing = dataclasses.replace(observations, seen=np.zeros(n, dtype=bool))
+    assert f"No ball was measured in any of {n} images." in observations_report(nothing)
+
+
+def test_matrices_report_shows_the_source_path(scan):
+    html = matrices_report(scan, exports=("astra", "rtk"))
+    path = figures_of(html)["figure-0"]["data"][0]
+    source = np.column_stack([path[k] for k in "xyz"])
+    np.testing.assert_allclose(source, scan.decompose().source, atol=1e-9)
+    assert "<li>astra</li>" in html
+    without = matrices_report(dataclasses.replace(scan, points_sigma=None))
+    assert "not determinable: the matrices hold no uncertainty" in without
+
+
+def test_reports_are_written_whole_or_not_at_all(tmp_path, full):
+    write_report(tmp_path / "r.html", full)
+    assert (tmp_path / "r.html").read_text(encoding="utf-8") == full
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FileError, match="cannot be written"):
+        write_report(tmp_path / "file" / "r.html", full)
+
+
+def test_thumbnails_need_images_for_every_row(sample):
+    from tomopose.report import worst_thumbnails
+
+    _, observations, _ = sample()
+    with pytest.raises(ShapeError, match="but 1 images"):
+        worst_thumbnails(observations, [np.zeros((4, 4))])
