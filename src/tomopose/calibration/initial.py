@@ -29,7 +29,8 @@ def ray_equations(problem: Problem) -> tuple[Array, Array]:
     d = np.empty((len(problem), 2))
     for r, scanner in enumerate(problem.scanners):
         mine = problem.run == r
-        P = scanner.P_S @ (scanner.T_WS.matrix @ scanner.T_TW(problem.alpha[mine]).matrix)
+        alpha, which = np.unique(problem.alpha[mine], return_inverse=True)
+        P = (scanner.P_S @ (scanner.T_WS.matrix @ scanner.T_TW(alpha).matrix))[which.reshape(-1)]
         rows = P[:, :2] - problem.x_D[mine][:, :, None] * P[:, 2:]
         n[mine], d[mine] = rows[:, :, :3] / scanner.d_SR, rows[:, :, 3] / scanner.d_SR
     return n, d

@@ -14,11 +14,14 @@ import numpy as np
 from tomopose.calibration.parameters import base_name
 from tomopose.calibration.residuals import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.result import Calibration
-from tomopose.geometry.rotations import skew
+from tomopose.geometry.frames import Frame
+from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.geometry.scanner import Scanner
+from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.units import Array
 
+TILT = np.radians(5.0)
 _ACTS = (*SCANNER_COLUMNS, "pitch_ratio")
 
 
@@ -76,3 +79,12 @@ def matrix_point_sigma_um(calibration: Calibration, poses: PoseSequence, x_W: An
     """(n, m) um: the same uncertainty carried back to the object, pixels times pitch over magnification."""
     s = calibration.scanner
     return matrix_point_sigma(calibration, poses, x_W) * np.sqrt(s.p_u * s.p_v) / s.magnification * 1000.0
+
+
+def tilt_sigma(calibration: Calibration, tilt: float = TILT) -> float:
+    """px: predicted standard uncertainty over the field of view (rms) of a scan tilted by `tilt` rad, table still."""
+    w = tilt * np.concatenate([np.eye(3), -np.eye(3)])
+    T_MH = RigidTransform(R=exp_rotation(w), t=np.zeros((6, 3)), source=Frame.M, target=Frame.H)
+    poses = PoseSequence(T_MH=T_MH, pose_id=tuple("abcdef"))
+    sigma = matrix_point_sigma(calibration, poses, field_of_view_points(calibration.scanner))
+    return float(np.sqrt(np.mean(sigma**2)))

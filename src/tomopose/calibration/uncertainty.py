@@ -25,11 +25,14 @@ def inverse_information(N: Array) -> Array:
     return (C + C.T) / 2
 
 
+def significant(chi2: float, dof: int) -> bool:
+    """Is chi2 larger than right covariances make it in one run of a hundred?"""
+    return dof > 0 and bool(chi2 > chdtri(dof, WIDENING_PROBABILITY))
+
+
 def widening(chi2: float, dof: int) -> float:
     """The factor on the covariance by the rule above: 1 or chi2/dof."""
-    if dof <= 0:
-        return 1.0
-    return chi2 / dof if chi2 > chdtri(dof, WIDENING_PROBABILITY) else 1.0
+    return chi2 / dof if significant(chi2, dof) else 1.0
 
 
 def angles_by_tangent(R: Array) -> Array:

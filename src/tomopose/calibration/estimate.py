@@ -1,0 +1,162 @@
+"""The optimum from the data alone: start, outliers, observability, covariance, and pose noise where it is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tomopose.calibration.fit import Fit, blocks, jacobian, minimise, tangent_names
+from tomopose.calibration.initial import closed_form, other_starts, ray_equations
+from tomopose.calibration.observability import cure, unobservable_directions
+from tomopose.calibration.parameters import UNITS, FreeParameters, free_parameters
+from tomopose.calibration.pose_noise import PoseNoise, estimate_pose_noise, total_covariance
+from tomopose.calibration.problem import Problem
+from tomopose.calibration.robust import RobustFit, robust_fit
+from tomopose.calibration.uncertainty import inverse_information, significant, widening
+from tomopose.errors import InputError, NotConvergedError, NotObservableError
+from tomopose.units import Array
+
+POOR_CHI2, POOR_SHARE = 9.0, 2e-3
+"""An optimum is suspected to be local when its median residual is 3 sigma and 0.2 % of the centres' spread."""
+
+
+def _median_residual(problem: Problem, free: FreeParameters, fit: Fit) -> tuple[float, float]:
+    r = problem.x_D - blocks(problem, free, fit).x_D
+    if not np.isfinite(r).all():
+        return np.inf, np.inf
+    d2 = ((problem.W @ r[:, :, None])[..., 0] ** 2).sum(axis=1)
+    return float(np.median(d2)), float(np.median(np.linalg.norm(r, axis=1)))
+
+
+def _poor(problem: Problem, free: FreeParameters, fit: Fit) -> tuple[bool, float]:
+    d2, d = _median_residual(problem, free, fit)
+    spread = float(np.sqrt(np.mean((problem.x_D - problem.x_D.mean(axis=0)) ** 2)))
+    return not fit.converged or (d2 > POOR_CHI2 and d > POOR_SHARE * spread), d2
+
+
+def best_fit(problem: Problem, free: FreeParameters) -> Fit:
+    """The optimum of all rows, from the closed form, or the best of the optima from many starts where it looks poor."""
+    n, d = ray_equations(problem)
+    held = free_parameters(problem.scanners, fix=tuple(UNITS))
+    fit = minimise(problem, held, closed_form(problem, n, d))
+    poor, measure = _poor(problem, held, fit)
+    if poor:
+        for start in other_starts(problem, n, d):
+            other = minimise(problem, held, start, iterations=30)
+            still_poor, other_measure = _poor(problem, held, other)
+            if other_measure < measure or not np.isfinite(measure):
+                fit, measure = other, other_measure
+            if not still_poor:
+                break
+        fit = minimise(problem, held, fit)
+    return minimise(problem, free, fit) if len(free) else fit
+
+
+def _prior_rows(free: FreeParameters, m: int) -> Array:
+    rows = np.zeros((len(free), m))
+    rows[:, m - len(free):] = np.diag(np.sqrt(free.information))
+    return rows[free.information > 0]
+
+
+def require_observable(problem: Problem, free: FreeParameters, J: Array) -> None:
+    """NotObservableError, in words, where data and priors together leave a direction unknown.  J (n, 2, m), px."""
+    names = tangent_names(problem.ball_ids, free)
+    whitened = np.concatenate([(problem.W @ J).reshape(-1, J.shape[2]), _prior_rows(free, J.shape[2])])
+    s, bad = unobservable_directions(whitened, names)
+    if bad:
+        direction, remedy = cure(problem, names, bad[-1])
+        raise NotObservableError(
+            f"the poses do not determine the calibration: {direction}; {remedy}",
+            direction=direction,
+            singular_values=tuple(float(x) for x in s),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solution:
+    """A robust fit with all that the later steps need.
+
+    problem, used: all rows, and those not set aside;  J: (used, 2, m) px;  x_calc: (used, 2) px.
+    chi2: by the covariances that were used;  covariance: (m, m), widened by the rule in `uncertainty`.
+    noise: the pose noise that the covariances include, or None.
+    """
+
+    problem: Problem
+    used: Problem
+    noise: PoseNoise | None
+    free: FreeParameters
+    robust: RobustFit
+    J: Array
+    x_calc: Array
+    chi2: float
+    dof: int
+    covariance: Array
+
+    @property
+    def fit(self) -> Fit:
+        return self.robust.fit
+
+def solve(
+    problem: Problem, free: FreeParameters, *, robust: bool = True, start: Fit | None = None,
+    noise: PoseNoise | None = None,
+) -> Solution:
+    """Best fit, outliers set aside, observability demanded, covariance by the stated rule."""
+    first = best_fit(problem, free) if start is None else minimise(problem, free, start)
+    if not np.isfinite(first.chi2):
+        raise NotConvergedError("no start led to an optimum with the ball in front of the source in every pose")
+    everything = np.ones(len(problem), dtype=bool)
+    require_observable(problem, free, jacobian(problem, free, blocks(problem, free, first)))
+    result = robust_fit(problem, free, first) if robust else RobustFit(
+        fit=first, keep=everything, distance2=np.full(len(problem), np.nan), scale=np.nan, misfit=False
+    )
+    used = problem.select(result.keep)
+    b = blocks(used, free, result.fit)
+    J = jacobian(used, free, b)
+    if not result.keep.all():
+        require_observable(used, free, J)
+    dof = 2 * len(used) + int((free.information > 0).sum()) - J.shape[2]
+    if dof <= 0:
+        raise InputError(f"{len(used)} poses leave no degree of freedom for {J.shape[2]} unknowns; image more poses")
+    chi2 = result.fit.chi2
+    return Solution(
+        problem=problem, used=used, noise=noise, free=free, robust=result, J=J, x_calc=b.x_D, chi2=chi2, dof=dof,
+        covariance=inverse_information(result.fit.N) * widening(chi2, dof),
+    )
+
+
+NOISE_ROUNDS = 3
+
+
+def with_pose_noise(solution: Solution, pose_noise: Any, *, robust: bool = True) -> Solution:
+    """The solution with the manipulator's scatter in the weights.
+
+    pose_noise: None (detection noise only), "auto" (variance components, where chi2 is significantly too large), or
+    the standard deviations (mm, rad) of a pose's translation and rotation, a coordinate each.
+    """
+    if pose_noise is None:
+        return solution
+    original = solution.problem
+    if isinstance(pose_noise, str):
+        if pose_noise != "auto":
+            raise InputError(f"pose_noise is {pose_noise!r}; None, 'auto' or two numbers (mm, rad) are needed")
+        if not significant(solution.chi2, solution.dof):
+            return solution
+    elif np.shape(pose_noise) != (2,) or not np.isfinite(pose_noise).all() or np.min(pose_noise) < 0:
+        raise InputError(f"pose_noise is {pose_noise!r}; two numbers (mm, rad), not negative, are needed")
+    for _ in range(NOISE_ROUNDS if isinstance(pose_noise, str) else 1):
+        used = original.select(solution.robust.keep)
+        at = blocks(used, solution.free, solution.fit)
+        if isinstance(pose_noise, str):
+            noise = estimate_pose_noise(
+                used.covariance, at, jacobian(used, solution.free, at), used.x_D - at.x_D
+            )
+        else:
+            noise = PoseNoise(translation=float(pose_noise[0]), rotation=float(pose_noise[1]))
+        if noise.translation == noise.rotation == 0.0:
+            return solution
+        everywhere = blocks(original, solution.free, solution.fit)
+        problem = original.with_covariance(total_covariance(original.covariance, everywhere, noise))
+        solution = solve(problem, solution.free, robust=robust, start=solution.fit, noise=noise)
+    return solution
