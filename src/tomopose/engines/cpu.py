@@ -12,7 +12,7 @@ import numpy as np
 from tomopose.engines import kernels
 from tomopose.engines.geometry import index_geometry
 from tomopose.engines.kernels import BORDER, MARGIN, TILE
-from tomopose.engines.protocol import Availability, Limits, Weight, require_images, require_views
+from tomopose.engines.protocol import Availability, Limits, Weight, require_images, require_support, require_views
 from tomopose.errors import InputError
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.volume import VoxelGrid
@@ -38,8 +38,8 @@ class CpuEngine:
     )
 
     def __init__(
-        self, matrices: ProjectionMatrices, grid: VoxelGrid, *, threads: int | None = None,
-        kernels: Literal["vector", "plain"] = "vector",
+        self, matrices: ProjectionMatrices, grid: VoxelGrid, *, support: np.ndarray | None = None,
+        threads: int | None = None, kernels: Literal["vector", "plain"] = "vector",
     ) -> None:
         if kernels not in ("vector", "plain"):
             raise InputError(f"kernels is {kernels!r}; 'vector' or 'plain' is needed")
@@ -50,6 +50,11 @@ class CpuEngine:
                 "let the volume be cut into slabs (memory_gib, scratch)"
             )
         self.matrices, self.grid = matrices, grid
+        support = require_support(support, grid)
+        self._support = (
+            np.zeros(0, dtype=np.uint8) if support is None
+            else np.ascontiguousarray(support.transpose(2, 1, 0), dtype=np.uint8).reshape(-1)
+        )
         self.threads = processors() if threads is None else threads
         self.vector = kernels == "vector"
         self._geometry = index_geometry(matrices, grid)
@@ -105,7 +110,7 @@ class CpuEngine:
         def part(start: int, stop: int) -> None:
             kernels.back_columns(
                 flat, self.grid.n_xyz, P, pixels, (n_u, n_v), scale, weight == "inverse-square", weight == "mean",
-                nonnegative, self.vector, start, stop,
+                nonnegative, self._support, self.vector, start, stop,
             )
 
         self._share(part, self.grid.n_xyz[0], TILE)

@@ -119,13 +119,14 @@ def _back_column_plain(
 @njit(cache=True, nogil=True)
 def back_columns(
     volume: Any, shape: Any, P: Any, images: Any, detector: Any, scale: float, inverse_square: bool, mean: bool,
-    nonnegative: bool, vector: bool, x_0: int, x_1: int,
+    nonnegative: bool, support: Any, vector: bool, x_0: int, x_1: int,
 ) -> None:
     """Add views to the columns x_0 <= x < x_1 of a volume.
 
     volume: flat, with margins; shape: (n_x, n_y, n_z); P: (m, 3, 4), index to pixel; images: (m, flat with border);
     detector: (n_u, n_v).  Adds scale times the sum of the views' look-ups, or with `mean` scale times their mean over
-    the views that see the voxel; `inverse_square` weights each by 1/w^2.
+    the views that see the voxel; `inverse_square` weights each by 1/w^2.  support: flat [x, y, z] without margins, 0
+    where a voxel has to stay 0, or empty.
     """
     n_x, n_y, n_z = shape
     n_u, n_v = detector
@@ -165,6 +166,11 @@ def back_columns(
                         seen += counts[z]
                         if seen > 0:
                             volume[at + z] += F32(scale) * sums[z] / F32(seen)
+                if support.size:
+                    inside = (x * n_y + y) * n_z
+                    for z in range(n_z):
+                        if not support[inside + z]:
+                            volume[at + z] = 0.0
                 if nonnegative:
                     for z in range(n_z):
                         volume[at + z] = max(volume[at + z], F32(0.0))

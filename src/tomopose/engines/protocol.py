@@ -51,7 +51,8 @@ class Engine(Protocol):
     """Forward and back-projection for one scan and one grid.
 
     Images are (m, n_v, n_u) float32, image[v, u], one for each index in `views`; line integrals in the unit of the
-    volume times mm.  An engine is made by `make_engine(name, matrices, grid)`.
+    volume times mm.  An engine is made by `make_engine(name, matrices, grid)`; with `support` (bool [z, y, x]) its
+    back-projections leave every voxel outside at zero.
     """
 
     name: str
@@ -90,6 +91,16 @@ def require_images(images: Any, views: Sequence[int], matrices: ProjectionMatric
         raise InputError(f"images are {images.shape}; {shape} (views, n_v, n_u) are needed")
     require_views(views, len(matrices))
     return images
+
+
+def require_support(support: Any, grid: VoxelGrid) -> np.ndarray | None:
+    """The support mask as bool [z, y, x]."""
+    if support is None:
+        return None
+    support = np.asarray(support)
+    if support.shape != grid.shape or support.dtype != np.bool_:
+        raise InputError(f"the support is {support.dtype} {support.shape}; bool {grid.shape} (z, y, x) is needed")
+    return support
 
 
 def require_views(views: Sequence[int], n: int) -> None:

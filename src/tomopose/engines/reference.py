@@ -15,6 +15,7 @@ from tomopose.engines.protocol import (
     Weight,
     box_lengths,
     require_images,
+    require_support,
     require_views,
 )
 from tomopose.geometry.projection import ProjectionMatrices, project
@@ -29,8 +30,11 @@ class ReferenceEngine:
         weights=("sum", "mean", "inverse-square"), exact_transpose=True, most_voxels=256**3, device="cpu"
     )
 
-    def __init__(self, matrices: ProjectionMatrices, grid: VoxelGrid) -> None:
+    def __init__(
+        self, matrices: ProjectionMatrices, grid: VoxelGrid, *, support: np.ndarray | None = None
+    ) -> None:
         self.matrices, self.grid = matrices, grid
+        self._support = require_support(support, grid)
         self._rays = matrices.decompose()
 
     def empty(self) -> np.ndarray:
@@ -115,6 +119,8 @@ class ReferenceEngine:
         if weight == "mean":
             total /= np.maximum(count, 1)
         into += scale * total.reshape(self.grid.shape)
+        if self._support is not None:
+            into[~self._support] = 0.0
         if nonnegative:
             np.maximum(into, 0, out=into)
 

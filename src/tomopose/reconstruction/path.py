@@ -1,0 +1,72 @@
+"""What kind of path the source takes about the object: circular or not, how much of a turn, and the weight of each view."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from tomopose.geometry.projection import ProjectionMatrices
+from tomopose.units import Array
+
+CIRCULAR_ELEVATION = math.radians(0.5)
+CIRCULAR_ROLL = math.radians(1.0)
+"""Up to these a path counts as circular: elevation of the source over its plane, and of detector rows against it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourcePath:
+    """axis: (3,) unit normal of the best plane through the sources, in W; centre: (3,) mm, of the circle in it.
+
+    angle: (n,) rad about the axis; weight: (n,) rad, the share of the turn of each view; distance: (n,) mm from source
+    to centre; elevation: (n,) rad over the plane; coverage: rad, the turn that is covered; circular: whether FDK's
+    assumption holds; full_turn: whether no gap stands out.
+    """
+
+    axis: Array
+    centre: Array
+    angle: Array
+    weight: Array
+    distance: Array
+    elevation: Array
+    coverage: float
+    circular: bool
+    full_turn: bool
+
+
+def source_path(matrices: ProjectionMatrices) -> SourcePath:
+    """The path of the source relative to the object."""
+    rays = matrices.decompose()
+    source = rays.source
+    mean = source.mean(axis=0)
+    _, spread, axes = np.linalg.svd(source - mean, full_matrices=True)
+    e_1, e_2, axis = axes
+    if axis[np.abs(axis).argmax()] < 0:
+        axis = -axis
+    x, y = (source - mean) @ e_1, (source - mean) @ e_2
+    # Kasa's circle: x^2 + y^2 = 2 a x + 2 b y + c, linear in a, b, c
+    (a, b, _), *_ = np.linalg.lstsq(np.stack([2 * x, 2 * y, np.ones_like(x)], axis=1), x**2 + y**2, rcond=None)
+    centre = mean + a * e_1 + b * e_2
+    arm = source - centre
+    distance = np.linalg.norm(arm, axis=1)
+    elevation = np.arcsin(np.clip(arm @ axis / distance, -1, 1))
+    angle = np.arctan2(arm @ np.cross(axis, e_1), arm @ e_1)
+    order = np.argsort(angle, kind="stable")
+    gap = np.diff(angle[order], append=angle[order[0]] + 2 * math.pi)
+    largest, typical = float(gap.max()), float(np.median(gap))
+    full = bool(largest <= max(3 * typical, 4 * math.pi / len(angle)))
+    weight = np.empty(len(angle))
+    shared = gap if full else np.where(gap == largest, typical, gap)
+    weight[order] = (shared + np.roll(shared, 1)) / 2
+    rows = rays.U / np.linalg.norm(rays.U, axis=1, keepdims=True)
+    circular = (
+        len(angle) > 2
+        and bool(np.abs(elevation).max() < CIRCULAR_ELEVATION)
+        and bool(np.abs(rows @ axis).max() < math.sin(CIRCULAR_ROLL))
+        and bool(spread[1] > 1e-3 * spread[0])
+    )
+    return SourcePath(
+        axis=axis, centre=centre, angle=angle, weight=weight, distance=distance, elevation=elevation,
+        coverage=float(shared.sum()), circular=circular, full_turn=full,
+    )

@@ -1,0 +1,156 @@
+r"""SART and ordered subsets, the FDK sum, and CGLS, over a volume that may lie anywhere.
+
+SART (Andersen and Kak, Ultrasonic Imaging 6 (1984) 81), for one subset S of views:
+
+    x <- x + lambda  mean_{j in S sees x}  [ (p_j - A_j x) / (A_j 1) ] looked up where x falls in view j
+
+A is Joseph's projector; the look-up is voxel-driven and bilinear, normalised by its own column sums.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from tomopose.reconstruction.checkpoint import Checkpoint
+from tomopose.reconstruction.fdk import FdkFilter
+from tomopose.reconstruction.field import Field
+from tomopose.reconstruction.line_integrals import LineIntegrals
+
+SHORTEST_RAY = 2.0
+"""Rays that cross less than this many voxels of the grid have no say: their residual would be divided by almost 0."""
+
+Subset = tuple[int, ...]
+Update = Callable[[Subset, list[Any]], None]
+
+
+def read_ahead(scan: LineIntegrals, subsets: Sequence[Subset]) -> Iterator[tuple[Subset, list[Any]]]:
+    """Each subset with its views (p, bad, fill), the next one read while this one is worked on.
+
+    At most two subsets are in memory.  p is laid out with v contiguous, as the CPU engine wants it.
+    """
+
+    def read(subset: Subset) -> list[Any]:
+        return [(np.asfortranarray(p), bad, fill) for p, bad, fill in (scan.view(j) for j in subset)]
+
+    with ThreadPoolExecutor(1, thread_name_prefix="tomopose-read") as reader:
+        coming = reader.submit(read, subsets[0]) if subsets else None
+        for k, subset in enumerate(subsets):
+            assert coming is not None
+            now = coming.result()
+            coming = reader.submit(read, subsets[k + 1]) if k + 1 < len(subsets) else None
+            yield subset, now
+
+
+def stacked(images: Iterable[np.ndarray]) -> np.ndarray:
+    """(m, n_v, n_u) of images, with v contiguous."""
+    return np.stack([image.T for image in images]).transpose(0, 2, 1)
+
+
+def sart_update(field: Field, *, relaxation: float, nonnegative: bool) -> Update:
+    """One SART step with a subset."""
+    shortest = SHORTEST_RAY * float(field.grid.spacing.min())
+
+    def update(subset: Subset, views: list[Any]) -> None:
+        residual = stacked(p for p, _, _ in views)
+        residual -= field.forward(subset)
+        length = field.lengths(subset)
+        with np.errstate(divide="ignore"):
+            residual *= np.where(length > shortest, 1 / length, 0).astype(np.float32)
+        for image, (_, bad, fill) in zip(residual, views, strict=True):
+            if fill.shape[0]:
+                image[bad] = fill @ np.where(bad, 0, image).ravel()
+        field.back(residual, subset, weight="mean", scale=relaxation, nonnegative=nonnegative)
+
+    return update
+
+
+def fdk_update(field: Field, filtered: FdkFilter, *, nonnegative: bool) -> Update:
+    """Add the views of a subset to the FDK sum."""
+
+    def update(subset: Subset, views: list[Any]) -> None:
+        images = stacked(filtered(p, j) for j, (p, _, _) in zip(subset, views, strict=True))
+        field.back(images, subset, weight="inverse-square", scale=1.0, nonnegative=nonnegative)
+
+    return update
+
+
+class Samples:
+    """Every stride-th pixel of the measured views, kept for the final comparison."""
+
+    def __init__(self, n: int, stride: int) -> None:
+        self.stride = stride
+        self.measured: list[np.ndarray | None] = [None] * n
+
+    def keep(self, subset: Subset, views: list[Any]) -> None:
+        for j, (p, _, _) in zip(subset, views, strict=True):
+            if self.measured[j] is None:
+                self.measured[j] = np.ascontiguousarray(p[:: self.stride, :: self.stride])
+
+    def view(self, scan: LineIntegrals, j: int) -> np.ndarray:
+        kept = self.measured[j]
+        return scan[j][:: self.stride, :: self.stride] if kept is None else kept
+
+
+def run(
+    schedule: Sequence[tuple[Update, Sequence[Subset]]], field: Field, scan: LineIntegrals, *,
+    samples: Samples, checkpoint: Checkpoint | None, progress: Callable[[int, int], None] | None,
+) -> None:
+    """All stages of a schedule, from where a checkpoint says."""
+    total = sum(len(subsets) for _, subsets in schedule)
+    done = checkpoint.resume(field) if checkpoint else 0
+    passed = 0
+    for update, subsets in schedule:
+        left = subsets[max(0, done - passed) :]
+        passed += len(subsets)
+        for count, (subset, views) in enumerate(read_ahead(scan, left), start=passed - len(left) + 1):
+            update(subset, views)
+            samples.keep(subset, views)
+            if checkpoint:
+                checkpoint.after(field, count)
+            if progress:
+                progress(count, total)
+
+
+def view_residuals(field: Field, scan: LineIntegrals, samples: Samples) -> np.ndarray:
+    """(n,): rms of measured minus reprojected over the sampled pixels of each view, over the rms of the measured."""
+    residual = np.empty(len(scan))
+    for j in range(len(scan)):
+        p = samples.view(scan, j).astype(np.float64)
+        q = field.sampled((j,), samples.stride)[0]
+        size = float(np.sqrt((p**2).mean()))
+        residual[j] = np.sqrt(((p - q) ** 2).mean()) / size if size > 0 else 0.0
+    return residual
+
+
+def cgls(
+    engine: Any, scan: LineIntegrals, *, iterations: int, progress: Callable[[int, int], None] | None = None
+) -> Any:
+    """Least squares |p - A x|^2 by conjugate gradients (Hestenes and Stiefel), from zero; A' is the engine's transpose.
+
+    Holds two volumes, the measured and one reprojected scan in memory beside the result.
+    """
+    views = list(range(len(scan)))
+    residual = np.stack([scan[j] for j in views])
+    x = engine.empty()
+    gradient = engine.transpose(residual, views)
+    direction = gradient.copy()
+    size = float(np.vdot(gradient, gradient))
+    for k in range(iterations):
+        if size == 0.0:
+            break
+        projected = engine.forward(direction, views)
+        alpha = size / float((projected.astype(np.float64) ** 2).sum())
+        x += np.float32(alpha) * direction
+        residual -= np.float32(alpha) * projected
+        gradient = engine.transpose(residual, views)
+        new = float(np.vdot(gradient, gradient))
+        direction *= np.float32(new / size)
+        direction += gradient
+        size = new
+        if progress:
+            progress(k + 1, iterations)
+    return x
