@@ -12,8 +12,8 @@ TOLERANCE_PX = 1e-6
 
 
 def matrices_of(rotation, distances, offsets, *, n_u, n_v, p_u, p_v):
-    """Columns of rotation (n, 3, 3): U, V and their cross product towards the source; distances (n, 2): origin and panel
-    from the source along the normal, mm; offsets (n, 4): of the source (mm) and of the panel's centre (px)."""
+    """Columns of rotation (n, 3, 3): U, V and their cross product towards the source; distances (n, 2): origin and
+    panel from the source along the normal, mm; offsets (n, 4): of the source (mm) and of the panel's centre (px)."""
     U, V, normal = (rotation[:, :, k] for k in range(3))
     S = offsets[:, :1] * U + offsets[:, 1:2] * V + distances[:, :1] * normal
     C = S - distances[:, 1:] * normal + offsets[:, 2:3] * p_u * U + offsets[:, 3:] * p_v * V
@@ -44,7 +44,7 @@ def random_matrices(seed, *, n=3, n_u=301, n_v=257, p_u=0.2, p_v=0.25, orientati
 
 @st.composite
 def geometries(draw):
-    """Odd and even sizes, non-square pixels, one or more views, tilts, table angles, gimbal locks and their surroundings."""
+    """Odd and even sizes, non-square pixels, one or more views, any pose, gimbal locks and their surroundings."""
     return random_matrices(
         draw(st.integers(0, 2**32 - 1)),
         n=draw(st.integers(1, 5)),

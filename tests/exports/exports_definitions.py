@@ -1,6 +1,6 @@
 """What each file of an export folder says, read with NumPy, JSON and XML alone, after the formats' own definitions.
 
-Every function returns pixels (n, m, 2) in D (origin in the centre of the bottom-left pixel, v up) of points (m, 3) in W.
+Every function returns pixels (n, m, 2) in D (origin: centre of the bottom-left pixel, v up) of points (m, 3) in W.
 """
 
 from __future__ import annotations

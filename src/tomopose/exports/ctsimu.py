@@ -49,7 +49,7 @@ def to_ctsimu(matrices: ProjectionMatrices) -> dict[str, Any]:
         },
         "geometry": {
             "detector": {"center": _centre(panel), **facing},
-            "source": {"center": _centre(np.zeros((1, 3))), **facing},
+            "source": {"type": "cone", "center": _centre(np.zeros((1, 3))), **facing},
             "stage": {
                 "center": _centre(stage),
                 "vector_u": _vector((1.0, 0.0, 0.0)),
@@ -66,6 +66,7 @@ def to_ctsimu(matrices: ProjectionMatrices) -> dict[str, Any]:
                 ],
             },
         },
+        "source": {"model": None, "manufacturer": None},
         "detector": {
             "model": None,
             "manufacturer": None,

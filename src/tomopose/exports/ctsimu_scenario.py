@@ -26,7 +26,7 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "rad": {"rad": 1.0, "deg": np.pi / 180},
     "": {"": 1.0},
 }
-REMARKS = ("comment", "comments", "description", "name", "type", "uncertainty", "uncertainty_unit")
+REMARKS = ("comment", "comments", "description", "name", "type", "beam_divergence", "uncertainty", "uncertainty_unit")
 
 
 def from_ctsimu(content: Mapping[str, Any], given: Given, *, where: str = "the CTSimU scenario") -> ProjectionMatrices:
@@ -45,6 +45,8 @@ def from_ctsimu(content: Mapping[str, Any], given: Given, *, where: str = "the C
         if (factor.get("value") if isinstance(factor, Mapping) else factor) not in (None, 1):
             raise InputError(f"{where}: acquisition.pixel_binning.{axis} is {factor!r}; only unbinned scans are read")
     geometry, detector = _section(content, "geometry", where), _section(content, "detector", where)
+    if _section(geometry, "source", f"{where}: geometry").get("type") == "parallel":
+        raise InputError(f"{where}: geometry.source.type is 'parallel'; only cone beams are read")
     parts = {
         name: _part(_section(geometry, name, f"{where}: geometry"), n, f"{where}: geometry.{name}", turn)
         for name, turn in (("source", None), ("detector", None), ("stage", stage_angles(acquisition, n, where)))

@@ -11,7 +11,7 @@ import json
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -82,8 +82,9 @@ def read_geometry(
         raise ConventionError(f"{path} is a file of format {found}, not {format}")
     name = format or found
     if name is None:
-        raise ConventionError(f"the format of {path} cannot be told from its content; give it (--format); "
-                              f"known are {', '.join(FORMATS)}")
+        raise ConventionError(
+            f"the format of {path} cannot be told from its content; give it (--format); known are {', '.join(FORMATS)}"
+        )
     if name == "rtk":
         return _read_rtk(content, given, side, path)
     if name == "cera":
@@ -108,11 +109,12 @@ def _load(path: Path) -> Any:
     try:
         with open(path, "rb") as stream:
             head = stream.read(6)
-        if head == b"\x93NUMPY":
-            return np.load(path, allow_pickle=False)
-        if head[:4] == b"PK\x03\x04":
-            with np.load(path, allow_pickle=False) as archive:
-                return {key: archive[key] for key in archive.files}
+            stream.seek(0)
+            if head == b"\x93NUMPY":
+                return np.load(stream, allow_pickle=False)
+            if head[:4] == b"PK\x03\x04":
+                with np.load(stream, allow_pickle=False) as archive:
+                    return {key: archive[key] for key in archive.files}
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise FileError(f"{path} cannot be read: {error.strerror or error}", path=path) from error
@@ -133,7 +135,8 @@ def _format_of(content: Any) -> str | None:
     if isinstance(content, str):
         if "<RTKThreeDCircularGeometry" in content:
             return "rtk"
-        return "cera" if content.startswith(("projtable.txt version", "#CERACONFIG")) else None
+        is_cera = content.startswith(("projtable.txt version", "#CERACONFIG")) or "ProjectionMatrixFilename" in content
+        return "cera" if is_cera else None
     if "OpenCTJSON" in content:
         return "openct"
     file = content.get("file")
@@ -172,7 +175,8 @@ def _read_cera(content: Any, given: Given, path: Path) -> ProjectionMatrices:
     _require_kind(content, str, "cera", path)
     if content.startswith("projtable.txt"):
         return from_cera(content, given, where=str(path))
-    table = path.parent / cera_config(content, where=str(path))[1]
+    # The names in a .config come from Windows: both kinds of separators occur.
+    table = path.parent / PureWindowsPath(cera_config(content, where=str(path))[1]).as_posix()
     if not table.is_file():
         raise FileError(f"{path} names the table {table.name}, but {table} does not exist", path=table)
     return from_cera(_read_text(table), given, config=content, where=str(path))
