@@ -89,7 +89,7 @@ def read_matrices_provenance(path: str | Path) -> Provenance | None:
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as archive:
             return {key: archive[key] for key in archive.files}
     except FileNotFoundError as error:
         raise FileError(f"{path} does not exist", path=path) from error

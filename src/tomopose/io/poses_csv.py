@@ -72,7 +72,16 @@ def read_poses(
     FileError
         If the file cannot be read.
     """
-    table = read_table(path)
+    return poses_from_table(read_table(path), units_confirmed=units_confirmed, forward=forward)
+
+
+def poses_from_table(
+    table: TextTable,
+    *,
+    units_confirmed: bool = False,
+    forward: Callable[[Array], RigidTransform] | None = None,
+) -> PoseSequence:
+    """The poses of a table that is already read; see `read_poses`."""
     convention = _convention(table)
     source = _source(table)
     joints = _joint_columns(table)

@@ -73,13 +73,16 @@ class TextTable:
                 values[i] = self._number(cell, i, column)
         return values
 
+    def digits(self, cell: str) -> str:
+        """A cell's number as Python writes it."""
+        written = NUMPY_REPR.fullmatch(cell)
+        cell = written["number"] if written else cell
+        return cell.replace(",", ".") if self.decimal_comma else cell
+
     def _number(self, cell: str, row: int, column: str) -> float:
         if not cell:
             raise InputError(f"{self.where(row, column)}: the cell is blank; give the number or leave the row out")
-        if self.decimal_comma:
-            cell = cell.replace(",", ".")
-        if written := NUMPY_REPR.fullmatch(cell):
-            cell = written["number"]
+        cell = self.digits(cell)
         if not NUMBER.fullmatch(cell):
             raise InputError(f"{self.where(row, column)}: {cell!r} is no finite number")
         if PLACEHOLDER.fullmatch(cell):
