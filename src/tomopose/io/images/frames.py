@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import errno
+import os
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -30,30 +30,20 @@ class FrameSource(Protocol):
 
 
 def read_block(path: Path, offset: int, shape: tuple[int, int], dtype: np.dtype[Any], band: Band) -> Image:
-    """Part of an uncompressed image that lies in one piece in a file; only its rows are read.
+    """Part of an uncompressed image that lies in one piece in a file: a mapped view, so that it is copied only once.
 
     dtype may be of the other endianness; the result is native.  FileError names a file that is too short.
     """
     r0, r1, c0, c1 = band
-    rows = np.empty((r1 - r0, shape[1]), dtype)
     try:
-        with open(path, "rb", buffering=0) as stream:
-            stream.seek(offset + r0 * shape[1] * dtype.itemsize)
-            read_fully(stream.readinto, rows.view(np.uint8).reshape(-1).data, path)
+        with open(path, "rb") as stream:
+            short = offset + shape[0] * shape[1] * dtype.itemsize - os.fstat(stream.fileno()).st_size
+            if short > 0:
+                raise FileError(f"{path} is truncated: it ends {short} bytes too early; copy it again", path=path)
+            image = np.memmap(stream, dtype, "r", offset, shape)
     except OSError as error:
         raise unreadable(path, error) from error
-    return rows[:, c0:c1].astype(dtype.newbyteorder("="), copy=False)
-
-
-def read_fully(readinto: Callable[[memoryview], int | None], target: memoryview, path: Path) -> None:
-    """Fill the buffer; a single read may give less than asked (2 GiB on Linux, less on network drives)."""
-    done = 0
-    while done < len(target):
-        got = readinto(target[done:])
-        if not got:
-            short = len(target) - done
-            raise FileError(f"{path} is truncated: it ends {short} bytes too early; copy it again", path=path)
-        done += got
+    return image[r0:r1, c0:c1].astype(dtype.newbyteorder("="), copy=False)
 
 
 def unreadable(path: Path, error: OSError) -> FileError:

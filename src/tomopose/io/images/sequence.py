@@ -70,9 +70,9 @@ class ImageSequence:
             raise InputError(f"region v {v0}:{v1}, u {u0}:{u1} is not inside an image of {n_u} x {n_v} pixels")
         k = self.index[i]
         if self.rows == "top-first":
-            part = np.ascontiguousarray(self.source.read(k, (n_v - v1, n_v - v0, u0, u1))[::-1])
+            part = np.array(self.source.read(k, (n_v - v1, n_v - v0, u0, u1))[::-1], order="C")
         else:
-            part = np.ascontiguousarray(self.source.read(k, (v0, v1, u0, u1)))
+            part = np.array(self.source.read(k, (v0, v1, u0, u1)), order="C")
         return part if self.correction is None else self.correction.transmission(part, v0, u0)
 
     @overload
