@@ -15,102 +15,93 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from scipy.linalg import cho_solve, solve_triangular
 
+from tomopose.calibration.fit import tangent_names
+from tomopose.calibration.parameters import FreeParameters, adjusted_scanners, translation_scale
+from tomopose.calibration.problem import Problem
 from tomopose.calibration.residuals import SCANNER_COLUMNS, projection_blocks, whiteners
-from tomopose.errors import NotConvergedError
+from tomopose.errors import NotConvergedError, TrajectoryError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import exp_rotation, skew
-from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.manipulator.real_poses import ErrorModel
+from tomopose.manipulator.real_poses import ErrorModel, Repeatability
 from tomopose.units import Array
 
 STEPS = 40
 COST_TOLERANCE = 1e-8
 """Relative to the number of equations: a step that gains less than this in chi2 ends the iteration."""
-RANK_TOLERANCE = 1e-12
-"""Singular values below this times the largest count as zero: nothing is known in that direction."""
 LEAST_DAMPING, LARGEST_DAMPING = 1e-6, 1e8
 
 
 @dataclass(frozen=True, kw_only=True)
 class KinematicProblem:
-    """What was measured, and what may be wrong.  Rows of poses, x_D and covariance belong together.
+    """What was measured, and what may be wrong.
 
-    x_D (n, 2) px, covariance (n, 2, 2) px^2: observed ball centres.
+    data:        observed centres, paired with poses.  poses: the commanded poses of its rows (T_MH, alpha, q).
     model:       error model of the manipulator, or None for a machine without errors.
-    free:        scanner parameter -> prior standard deviation (inf: none).
-    bars:        (ball a, ball b) -> (distance, its standard uncertainty), mm.
+    free:        freed scanner parameters with their priors.
+    bars:        (ball id, ball id) -> (distance, its standard uncertainty), mm.
     view_sigma:  scanner parameter -> standard deviation of its scatter from view to view (a C-arm's d_SD, say).
-    scatter:     factor f on the variance of the model's repeatability.
+    repeatability, scatter:  of the plate from pose to pose, and the factor f on its variance.
+    weight:      (n,) factor on the inverse covariances of the rows, or None.
     """
 
-    scanner: Scanner
+    data: Problem
     poses: PoseSequence
-    x_D: Array
-    covariance: Array
+    free: FreeParameters
     model: ErrorModel | None = None
-    free: Mapping[str, float] = field(default_factory=dict)
     bars: Mapping[tuple[int, int], tuple[float, float]] = field(default_factory=dict)
     view_sigma: Mapping[str, float] = field(default_factory=dict)
+    repeatability: Repeatability = field(default_factory=Repeatability)
     scatter: float = 1.0
-    repeatability: Array | None = None
-
-    @property
-    def ball_ids(self) -> tuple[int, ...]:
-        return tuple(int(i) for i in np.unique(self.poses.ball_id))
+    weight: Array | None = None
 
     @property
     def tangent(self) -> tuple[str, ...]:
         """Names of the coordinates of theta, in order, as `Calibration.tangent` has them."""
-        ids = self.ball_ids
-        balls = [f"t_{x}" for x in "xyz"] if len(ids) == 1 else [f"t[{i}]_{x}" for i in ids for x in "xyz"]
-        mount = [f"{what}_HT_{x}" for what in "wt" for x in "xyz"]
-        return (*mount, *balls, *self.free, *(() if self.model is None else self.model.names))
+        return (*tangent_names(self.data.ball_ids, self.free), *(() if self.model is None else self.model.names))
 
     @property
     def prior_sigma(self) -> Array:
         """Prior standard deviation of each coordinate of theta; inf where there is none."""
-        flat = np.full(6 + 3 * len(self.ball_ids), np.inf)
-        errors = np.zeros(0) if self.model is None else self.model.sigma
-        return np.concatenate([flat, list(self.free.values()), errors])
+        flat = np.full(6 + 3 * len(self.data.ball_ids), np.inf)
+        return np.concatenate([flat, self.free.sigma, np.zeros(0) if self.model is None else self.model.sigma])
 
-    def rows(self, index: Array) -> KinematicProblem:
-        """The same problem with those rows only."""
-        return replace(
-            self, poses=self.poses.select(index), x_D=self.x_D[index], covariance=self.covariance[index]
-        )
+    def rows(self, index: Any) -> KinematicProblem:
+        """The same problem with those rows only; every ball must keep a row."""
+        weight = None if self.weight is None else self.weight[index]
+        return replace(self, data=self.data.select(index), poses=self.poses.select(index), weight=weight)
 
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """A point theta: mount, balls (nb, 3) in the order of ball ids, scanner, manipulator errors p."""
+    """A point theta: mount, balls (nb, 3), deviations delta (f,) of the freed parameters, manipulator errors p (m,)."""
 
     T_HT: RigidTransform
     balls: Array
-    scanner: Scanner
+    delta: Array
     p: Array
 
-    def moved(self, step: Array, free: tuple[str, ...]) -> State:
-        nb, nf = self.balls.size, len(free)
-        values = {n: getattr(self.scanner, n) + d for n, d in zip(free, step[6 + nb : 6 + nb + nf], strict=True)}
-        T_HT = RigidTransform(
-            R=exp_rotation(step[:3]) @ self.T_HT.R, t=self.T_HT.t + step[3:6], source=Frame.H, target=Frame.T
-        )
+    def moved(self, step: Array) -> State:
+        cut = np.cumsum([3, 3, self.balls.size, self.delta.size])
+        w, t, balls, delta, p = np.split(step, cut)
+        R = exp_rotation(w) @ self.T_HT.R
         return State(
-            T_HT=T_HT,
-            balls=self.balls + step[6 : 6 + nb].reshape(-1, 3),
-            scanner=replace(self.scanner, **values) if free else self.scanner,
-            p=self.p + step[6 + nb + nf :],
+            T_HT=RigidTransform(R=R, t=self.T_HT.t + t, source=Frame.H, target=Frame.T),
+            balls=self.balls + balls.reshape(-1, 3),
+            delta=self.delta + delta,
+            p=self.p + p,
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Linearised:
-    """Residuals r (n, 2) observed minus calculated, px; J (n, 2, m) of the prediction; C (n, 2, 2) px^2;
+    """Residuals r (n, 2) observed minus calculated, px; J (n, 2, m) of the prediction; C (n, 2, 2) px^2, with scatter;
     J_pose (n, 2, 6) by (w, t) of the plate."""
 
     r: Array
@@ -121,16 +112,14 @@ class Linearised:
 
 @dataclass(frozen=True, kw_only=True)
 class MapEstimate:
-    """The optimum: state, linearisation there, covariance (m, m), chi2 with priors, dof = equations - free parameters
-    without a prior, log_evidence (Laplace; comparable between models of the same observations)."""
+    """The optimum: state, linearisation there, covariance (m, m), chi2 with priors, dof = equations - parameters
+    (+ priors), log_evidence (Laplace; comparable between models of the same observations)."""
 
     problem: KinematicProblem
     state: State
     at: Linearised
     covariance: Array
-    singular_values: Array
     chi2: float
-    chi2_data: float
     dof: int
     log_evidence: float
     steps: int
@@ -138,50 +127,45 @@ class MapEstimate:
 
 def linearise(problem: KinematicProblem, state: State) -> Linearised:
     """The prediction and its derivatives at theta."""
-    poses = problem.poses
-    row_of = {ball: k for k, ball in enumerate(problem.ball_ids)}
-    ball_row = np.array([row_of[int(i)] for i in poses.ball_id])
-    n, nb = len(poses), len(row_of)
+    data, poses, free = problem.data, problem.poses, problem.free
+    n, nb = len(poses), len(data.ball_ids)
     T_MH, J_errors = poses.T_MH, np.zeros((n, 6, 0))
     if problem.model is not None:
         real = problem.model.real_poses(poses, state.p)
         T_MH, J_errors = real.T_MH, real.J
+    scale = translation_scale(free, state.delta)
     blocks = projection_blocks(
-        state.scanner, T_HT=state.T_HT, T_MH=T_MH, t=state.balls[ball_row], alpha=poses.alpha
+        adjusted_scanners(data.scanners, free, state.delta), T_HT=state.T_HT, T_MH=T_MH, t=state.balls[data.ball],
+        alpha=data.alpha, translation_scale=scale, run=data.run,
     )
-    J_pose = np.concatenate([-blocks.G_H @ skew(blocks.x_H - T_MH.t), blocks.G_H], axis=2)
+    J_pose = np.concatenate([-blocks.G_H @ skew(blocks.x_H - scale * T_MH.t), scale * blocks.G_H], axis=2)
     J_balls = np.zeros((n, 2, nb, 3))
-    J_balls[np.arange(n), :, ball_row] = blocks.J_t
-    columns = [SCANNER_COLUMNS.index(name) for name in problem.free]
-    J = np.concatenate(
-        [blocks.J_mount, J_balls.reshape(n, 2, 3 * nb), blocks.J_scanner[:, :, columns], J_pose @ J_errors], axis=2
-    )
-    C = problem.covariance.copy()
-    variance = problem.repeatability
-    if variance is None and problem.model is not None:
-        variance = problem.model.repeatability.variance
-    if variance is not None:
-        C = C + problem.scatter * (J_pose * variance) @ np.swapaxes(J_pose, 1, 2)
+    J_balls[np.arange(n), :, data.ball] = blocks.J_t
+    mine = (free.col_run[None, :] < 0) | (free.col_run[None, :] == data.run[:, None])
+    J_free = blocks.J_scanner[:, :, free.cols] * free.factor * mine[:, None, :]
+    J = np.concatenate([blocks.J_mount, J_balls.reshape(n, 2, 3 * nb), J_free, J_pose @ J_errors], axis=2)
+    C = data.covariance + problem.scatter * (J_pose * problem.repeatability.variance) @ np.swapaxes(J_pose, 1, 2)
     for name, sigma in problem.view_sigma.items():
         g = blocks.J_scanner[:, :, SCANNER_COLUMNS.index(name)] * sigma
         C = C + g[:, :, None] * g[:, None, :]
-    return Linearised(r=problem.x_D - blocks.x_D, J=J, C=C, J_pose=J_pose)
+    if problem.weight is not None:
+        C = C / problem.weight[:, None, None]
+    return Linearised(r=data.x_D - blocks.x_D, J=J, C=C, J_pose=J_pose)
 
 
 def _bar_rows(problem: KinematicProblem, state: State) -> tuple[Array, Array]:
     """Weighted residuals (nbar,) and rows (nbar, m) of the known distances between balls."""
-    ids = problem.ball_ids
-    rows, m = [], len(problem.tangent)
-    r = []
+    ids = problem.data.ball_ids
+    r, rows = [], []
     for (a, b), (length, u) in problem.bars.items():
         i, j = ids.index(a), ids.index(b)
         d = state.balls[i] - state.balls[j]
         distance = float(np.linalg.norm(d))
-        row = np.zeros(m)
+        row = np.zeros(len(problem.tangent))
         row[6 + 3 * i : 9 + 3 * i], row[6 + 3 * j : 9 + 3 * j] = d / distance / u, -d / distance / u
         rows.append(row)
         r.append((length - distance) / u)
-    return np.array(r), np.reshape(rows, (len(r), m))
+    return np.array(r), np.reshape(rows, (len(r), len(problem.tangent)))
 
 
 def _weighted(
@@ -197,20 +181,28 @@ def _weighted(
     r_bar, J_bar = _bar_rows(problem, state)
     sigma = problem.prior_sigma
     held = np.flatnonzero(np.isfinite(sigma))
-    freed = np.array([getattr(state.scanner, n) - getattr(problem.scanner, n) for n in problem.free])
-    value = np.concatenate([np.zeros(m - len(freed) - len(state.p)), freed, state.p])
+    value = np.concatenate([np.zeros(6 + state.balls.size), state.delta, state.p])
     J_prior = np.zeros((len(held), m))
     J_prior[np.arange(len(held)), held] = 1 / sigma[held]
     r = np.concatenate([(W @ at.r[:, :, None])[..., 0].ravel(), r_bar, -(value / sigma)[held]])
     return r, np.concatenate([(W @ at.J).reshape(-1, m), J_bar, J_prior]), at, W
 
 
-def _svd(J: Array) -> tuple[Array, Array, Array, Array]:
-    """U, s, V^T of J with columns of length 1, and those lengths."""
-    scale = np.sqrt(np.einsum("ij,ij->j", J, J))
+def _factor(J: Array, damping: float = 0.0) -> tuple[Array, Array] | None:
+    """Cholesky's L of J^T J with columns of length 1 (plus damping), and those lengths; None where it is singular.
+
+    The priors keep the condition of J below 1e5, so that its square is harmless; a factor is ten times faster than an
+    SVD of some hundred equations.
+    """
+    N = J.T @ J
+    scale = np.sqrt(np.diag(N))
     scale = np.where(scale > 0, scale, 1.0)
-    U, s, Vt = np.linalg.svd(J / scale, full_matrices=False)
-    return U, s, Vt, scale
+    N = N / scale[:, None] / scale
+    N[np.diag_indices(len(N))] += damping
+    try:
+        return np.linalg.cholesky(N), scale
+    except np.linalg.LinAlgError:
+        return None
 
 
 def solve_map(problem: KinematicProblem, start: State) -> MapEstimate:
@@ -218,59 +210,70 @@ def solve_map(problem: KinematicProblem, start: State) -> MapEstimate:
 
     Raises NotConvergedError where no optimum is reached.
     """
-    state, damping, free = start, 0.0, tuple(problem.free)
-    drop = np.inf
+    state, damping, drop = start, 0.0, np.inf
+    r, J, at, W = _weighted(problem, state)
+    if not np.isfinite(r).all():
+        raise NotConvergedError("at the start a ball lies behind the source; the start is too far off")
     for step in range(1, STEPS + 1):
-        r, J, at, W = _weighted(problem, state)
-        if not np.isfinite(r).all():
-            raise NotConvergedError("at the start a ball lies behind the source; the start is too far off")
-        if abs(drop) < COST_TOLERANCE * len(r):
-            return _estimate(problem, state, r, J, at, step)
-        U, s, Vt, scale = _svd(J)
-        along = U.T @ r
         while True:
-            gain = np.where(s > s[0] * RANK_TOLERANCE, s / np.maximum(s**2 + damping, 1e-300), 0.0)
-            trial = state.moved((Vt.T @ (gain * along)) / scale, free)
-            r_new = _weighted(problem, trial, W)[0]
-            drop = float(r @ r - r_new @ r_new)
-            if np.isfinite(r_new).all() and drop > -COST_TOLERANCE * len(r):
-                state, damping = trial, damping / 10 if damping > LEAST_DAMPING else 0.0
+            factor = _factor(J, damping)
+            drop = -np.inf
+            if factor is not None:
+                L, scale = factor
+                trial = state.moved(cho_solve((L, True), J.T @ r / scale) / scale)
+                try:
+                    new = _weighted(problem, trial, W)
+                    drop = float(r @ r - new[0] @ new[0]) if np.isfinite(new[0]).all() else -np.inf
+                except TrajectoryError:  # errors so large that the machine cannot reach its own poses
+                    drop = -np.inf
+            if drop > -COST_TOLERANCE * len(r):
                 break
             damping = max(damping * 10, LEAST_DAMPING)
             if damping > LARGEST_DAMPING:
                 raise NotConvergedError(f"step {step}: no direction lowers chi2 = {r @ r:.6g}, and it is no optimum")
+        state, at = trial, new[2]
+        W = whiteners(at.C)
+        r, J = _reweighted(problem, new[0], new[1], at, W)
+        if abs(drop) < COST_TOLERANCE * len(r) and damping < 1.0:
+            return _estimate(problem, state, r, J, at, step)
+        damping = damping / 10 if damping > LEAST_DAMPING else 0.0
     raise NotConvergedError(f"no optimum after {STEPS} steps; the last one still gained {drop:.3g} in chi2")
 
 
+def _reweighted(problem: KinematicProblem, r: Array, J: Array, at: Linearised, W: Array) -> tuple[Array, Array]:
+    """Rows r and J with the observations' part whitened by W; bars and priors stay."""
+    k = at.r.size
+    return (
+        np.concatenate([(W @ at.r[:, :, None]).ravel(), r[k:]]),
+        np.concatenate([(W @ at.J).reshape(k, -1), J[k:]]),
+    )
+
+
 def _estimate(problem: KinematicProblem, state: State, r: Array, J: Array, at: Linearised, steps: int) -> MapEstimate:
-    _, s, Vt, scale = _svd(J)
-    inverse = np.where(s > s[0] * RANK_TOLERANCE, 1 / np.maximum(s, 1e-300), np.inf)
-    half = np.where(np.isfinite(inverse), inverse, 0.0)[:, None] * Vt / scale
+    factor = _factor(J)
+    if factor is None:
+        raise NotConvergedError("the poses leave a direction of the unknowns undetermined; free fewer parameters")
+    L, scale = factor
+    half = np.asarray(solve_triangular(L, np.eye(len(L)), lower=True)) / scale
     sigma = problem.prior_sigma
     held = sigma[np.isfinite(sigma)]
-    n_data = at.r.size
-    chi2, chi2_data = float(r @ r), float(r[:n_data] @ r[:n_data])
-    log_det = 2 * float(np.sum(np.log(np.where(s > 0, s, 1e-300))) + np.sum(np.log(scale)))
-    log_evidence = -0.5 * (
-        chi2 + float(np.sum(np.log(np.linalg.det(at.C)))) + 2 * float(np.sum(np.log(held))) + log_det
-    )
+    chi2 = float(r @ r)
+    log_det = 2 * float(np.sum(np.log(np.diag(L))) + np.sum(np.log(scale)))
+    log_det_C = float(np.sum(np.log(at.C[:, 0, 0] * at.C[:, 1, 1] - at.C[:, 0, 1] * at.C[:, 1, 0])))
     return MapEstimate(
         problem=problem,
         state=state,
         at=at,
         covariance=half.T @ half,
-        singular_values=s,
         chi2=chi2,
-        chi2_data=chi2_data,
         dof=len(r) - J.shape[1],
-        log_evidence=log_evidence,
+        log_evidence=-0.5 * (chi2 + log_det_C + 2 * float(np.sum(np.log(held))) + log_det),
         steps=steps,
     )
 
 
-def parameter_units(problem: KinematicProblem) -> tuple[str, ...]:
-    """The unit of each coordinate of theta."""
-    return (
-        *("rad",) * 3, *("mm",) * 3, *("mm",) * (3 * len(problem.ball_ids)),
-        *(PARAMETER_UNITS[name] for name in problem.free), *(() if problem.model is None else problem.model.units),
-    )
+def singular_values(estimate: MapEstimate) -> Array:
+    """(m,) of the weighted Jacobian with its priors, columns of length 1, largest first."""
+    _, J, _, _ = _weighted(estimate.problem, estimate.state)
+    s: Array = np.linalg.svd(J / np.maximum(np.linalg.norm(J, axis=0), 1e-300), compute_uv=False)
+    return s

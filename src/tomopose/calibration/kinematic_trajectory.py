@@ -10,8 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from tomopose.calibration.residuals import SCANNER_COLUMNS, projection_blocks
+from tomopose.calibration.result import Calibration
 from tomopose.geometry.projection import project
 from tomopose.geometry.rotations import exp_rotation, skew
+from tomopose.manipulator.error_models import correction
+from tomopose.manipulator.poses import PoseSequence
 from tomopose.units import Array
 
 POSE_STEPS = 12
@@ -53,3 +57,57 @@ def without_object_pose(P: Any, P_true: Any, points: Any) -> Array:
 def rms_px(d: Array) -> float:
     """Root mean square distance, px, of differences (..., 2)."""
     return float(np.sqrt(np.mean(np.sum(d**2, axis=-1))))
+
+
+def trajectory_jacobian(calibration: Calibration, poses: PoseSequence, points: Any) -> tuple[Array, Array]:
+    """How the scan's pixels answer to what was estimated, with the object's rigid pose removed.
+
+    Returns J (n, m, 2, c): derivatives, px, of points (m, 3) of W at home by the coordinates of `calibration.tangent`,
+    after the rigid pose of the object that undoes most of each; and J_pose (n, m, 2, 6) by (w, t) of the plate, rad and
+    mm, in H.  `poses` are the commanded ones; identified errors of the manipulator are applied here.
+    """
+    scanner, names, R_HT = calibration.scanner, calibration.tangent, calibration.T_HT.R
+    block = calibration.manipulator
+    scale = float(block.get("translation_scale", 1.0))
+    scale += sum(p.value - 1.0 for p in calibration.parameters if p.name == "translation_scale" and "kind" in block)
+    fixed = correction(block if "kind" in block else {}, poses)
+    T_MH = fixed.poses.T_MH
+    x = np.asarray(points, dtype=np.float64)
+    x_M = (scanner.T_TW(0.0).inv.apply(x) - calibration.T_HT.t) @ R_HT
+    n, m = len(poses), len(x)
+    J = np.zeros((n, m, 2, len(names)))
+    J_pose = np.zeros((n, m, 2, 6))
+    rigid_pose = np.zeros((n, m, 2, 6))
+    freed = [(j, name.split("[")[0]) for j, name in enumerate(names)]
+    errors = [names.index(name) for name in fixed.names]
+    for i in range(m):
+        b = projection_blocks(
+            scanner, T_HT=calibration.T_HT, T_MH=T_MH, t=x_M[i], alpha=poses.alpha, translation_scale=scale
+        )
+        J_pose[:, i] = np.concatenate([-b.G_H @ skew(b.x_H - scale * T_MH.t), scale * b.G_H], axis=2)
+        rigid_pose[:, i] = np.concatenate([-b.J_t @ skew(x_M[i]), b.J_t], axis=2)
+        J[:, i, :, :6] = b.J_mount
+        J[:, i, :, errors] = np.moveaxis(J_pose[:, i] @ fixed.J, 2, 0)
+        for j, name in freed:
+            if name in SCANNER_COLUMNS or name == "pitch_ratio":
+                column, factor = ("p_u", scanner.p_v) if name == "pitch_ratio" else (name, 1.0)
+                J[:, i, :, j] = b.J_scanner[:, :, SCANNER_COLUMNS.index(column)] * factor
+    G = rigid_pose.reshape(-1, 6)
+    Q, _ = np.linalg.qr(G / np.linalg.norm(G, axis=0))
+    flat = J.reshape(-1, len(names))
+    flat = flat - Q @ (Q.T @ flat)
+    return flat.reshape(J.shape), J_pose
+
+
+def trajectory_sigma(calibration: Calibration, poses: PoseSequence, points: Any, *, scatter: bool = False) -> Array:
+    """(n, m, 2) px: standard uncertainty of points (m, 3) of W at home in a scan, the object's rigid pose removed.
+
+    scatter: add how far the plate will stand off from pose to pose (the identified scatter), for the single view.
+    """
+    J, J_pose = trajectory_jacobian(calibration, poses, points)
+    V = np.einsum("nmic,cd,nmid->nmi", J, calibration.covariance, J, optimize=True)
+    found = calibration.manipulator.get("scatter")
+    if scatter and found is not None:
+        variance = np.repeat([found["w_rad"] ** 2, found["t_mm"] ** 2], 3)
+        V = V + np.einsum("nmia,a,nmia->nmi", J_pose, variance, J_pose, optimize=True)
+    return np.sqrt(np.maximum(V, 0.0))

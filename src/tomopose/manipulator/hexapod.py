@@ -21,7 +21,7 @@ Source: the constraint equations of the Stewart-Gough platform, e.g. Merlet, Par
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -182,8 +182,7 @@ class Hexapod:
             rhs[:, :, part["leg_offset"][0]] += np.eye(6)
         if "leg_scale" in part:
             rhs[:, :, part["leg_scale"][0]] += legs[:, :, None] * np.eye(6)
-        J: Array = np.linalg.solve(A, rhs)
-        return J
+        return np.asarray(np.linalg.solve(A, rhs), dtype=np.float64)
 
     def _require_limits(self, legs: Array) -> None:
         if self.leg_limits is None:
@@ -197,6 +196,11 @@ class Hexapod:
                 indices=bad.tolist(),
                 limits=self.leg_limits,
             )
+
+    def resized(self, size: float) -> Hexapod:
+        """The same hexapod with all standard deviations of its errors multiplied by `size`."""
+        names = ("joint_sigma", "leg_sigma", "leg_scale_sigma", "axes_sigma", "pivot_sigma")
+        return replace(self, **{name: size * getattr(self, name) for name in names})
 
     def to_json(self) -> dict[str, Any]:
         """The content of hexapod.json."""
@@ -228,9 +232,8 @@ def _forward(b: Array, p: Array, legs: Array, R: Array, t: Array) -> tuple[Array
     scaling = np.repeat([1 / radius, 1.0], 3)
     for count in range(NEWTON_STEPS):
         length, A = _legs(b, p, R, t)
-        singular_values = np.linalg.svd(A * scaling, compute_uv=False) if count == 0 else None
-        if singular_values is not None:
-            condition = singular_values[:, 0] / np.maximum(singular_values[:, -1], 1e-300)
+        if count == 0:
+            condition = _condition(A * scaling)
             bad = np.flatnonzero(~(condition < SINGULAR_CONDITION))
             if bad.size:
                 raise TrajectoryError(
@@ -242,14 +245,23 @@ def _forward(b: Array, p: Array, legs: Array, R: Array, t: Array) -> tuple[Array
         error = legs - length
         if np.abs(error).max() < NEWTON_TOLERANCE:
             return R, t, A
-        step: Array = np.linalg.solve(A, error[..., None])[..., 0]
-        R, t = moved(R, t, step)
+        R, t = moved(R, t, np.asarray(np.linalg.solve(A, error[..., None])[..., 0], dtype=np.float64))
     bad = np.flatnonzero(np.abs(error).max(axis=1) >= NEWTON_TOLERANCE)
     raise OutOfReachError(
         f"{bad.size} poses cannot be reached: no plate pose has these legs; pose {bad[0]} is left with "
         f"{np.abs(error[bad[0]]).max():.3g} mm in a leg",
         indices=bad.tolist(),
     )
+
+
+def _condition(A: Array) -> Array:
+    """(n,): |A| |A^-1| in Frobenius' norm, inf where A has no inverse."""
+    try:
+        inverse = np.linalg.inv(A)
+    except np.linalg.LinAlgError:
+        singular_values = np.linalg.svd(A, compute_uv=False)
+        return np.where(singular_values[:, -1] > 0, singular_values[:, 0] / np.maximum(singular_values[:, -1], 1e-300), np.inf)
+    return np.asarray(np.linalg.norm(A, axis=(1, 2)) * np.linalg.norm(inverse, axis=(1, 2)))
 
 
 def _turned_axes(R: Array, t: Array, c: Array, q: Array) -> tuple[Array, Array, Array, Array]:

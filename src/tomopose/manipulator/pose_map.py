@@ -14,7 +14,7 @@ kinematics the turns are not determined by one ball, and this model says so by i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations_with_replacement
 from typing import Any
 
@@ -86,6 +86,10 @@ class PoseMap:
         J_out[:, :3, :3], J_out[:, 3:, 3:] = left_jacobian(delta[:, :3]), np.eye(3)
         J = np.einsum("nj,nab->najb", phi, J_out).reshape(len(poses), 6, -1)
         return RealPoses(R=R, t=t, J=J)
+
+    def resized(self, size: float) -> PoseMap:
+        """The same map with errors expected to be `size` times as large."""
+        return replace(self, t_sigma=size * self.t_sigma, w_sigma=size * self.w_sigma)
 
     def to_json(self) -> dict[str, Any]:
         return {

@@ -78,6 +78,10 @@ class ErrorModel(Protocol):
         """Where the real plate stands when the controller is told `poses` and the machine has the errors p."""
         ...
 
+    def resized(self, size: float) -> ErrorModel:
+        """The same machine with the standard deviations of all its errors multiplied by `size`."""
+        ...
+
     def to_json(self) -> dict[str, Any]: ...
 
 

@@ -17,7 +17,7 @@ Systems 2 (1985) 397; Mooring, Roth & Driels, Fundamentals of Manipulator Calibr
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -215,7 +215,8 @@ class SerialRobot:
             bad = np.flatnonzero(~arrived)
             raise OutOfReachError(
                 f"the robot cannot reach {bad.size} poses; pose {bad[0]} is missed by "
-                f"{left[bad[0]] * self._length:.3g} mm at best; check robot.json, its tool and q_start_deg, and that poses are given in the robot's base",
+                f"{left[bad[0]] * self._length:.3g} mm at best; check robot.json, its tool and q_start_deg, and that "
+                "poses are given in the robot's base",
                 indices=bad.tolist(),
             )
         singular_values = np.linalg.svd(J, compute_uv=False)
@@ -294,6 +295,11 @@ class SerialRobot:
         J[:, 3:] += np.cross(J[:, :3], arm[:, :, None], axis=1)
         T = T @ extra
         return RealPoses(R=T[:, :3, :3], t=T[:, :3, 3], J=J)
+
+    def resized(self, size: float) -> SerialRobot:
+        """The same robot with all standard deviations of its errors multiplied by `size`."""
+        joints = tuple(replace(j, sigma={k: size * v for k, v in j.sigma.items()}) for j in self.joints)
+        return replace(self, joints=joints)
 
     def to_json(self) -> dict[str, Any]:
         """The content of robot.json."""

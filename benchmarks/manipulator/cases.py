@@ -1,0 +1,155 @@
+"""Virtual experiments: a machine with known errors, radiographs of balls, and how far the scan's matrices are off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from tomopose import BallObservations, Calibration, Frame, PoseSequence, RigidTransform, Scanner
+from tomopose.calibration.apply import projection_matrices
+from tomopose.calibration.kinematic_trajectory import object_points, rms_px, trajectory_sigma, without_object_pose
+from tomopose.calibration.solve import calibrate
+from tomopose.geometry.projection import eq5_matrices, project_ball
+from tomopose.geometry.rotations import R_y, R_z
+from tomopose.manipulator.serial import poses_from_joints
+from tomopose.manipulator.virtual import Disturbance, real_motion
+
+SCANNER = Scanner(
+    d_SD=1500.0, d_SR=283.5, p_u=0.2, p_v=0.2, u_0=1021.37, v_0=1026.81, n_u=2048, n_v=2048
+)
+"""Magnification 5.3 of the paper."""
+DETECTION_PX = 0.0207
+"""rms distance of detected centres from the true ones, table 1: both coordinates together."""
+UM_PER_PX = 200.0 / SCANNER.magnification
+
+
+def paper_poses() -> PoseSequence:
+    """The paper's 3 x 3 x 3 x 7 poses, table still (sec. 5)."""
+    grid = np.array(np.meshgrid([-10, 0, 10], [-10, 0, 10], [-10, 0, 10], indexing="ij")).reshape(3, -1).T
+    turns = 5.0 * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+    return PoseSequence.from_table(np.repeat(grid, 7, axis=0), np.tile(turns, (27, 1)))
+
+
+def mixed_poses(rng: np.random.Generator, *, n: int = 189, balls: int = 1) -> PoseSequence:
+    """Any positions and tilts within the same travel, at table angles 0, 90, 180, 270 deg; balls by turns."""
+    return PoseSequence.from_table(
+        rng.uniform(-10, 10, (n, 3)),
+        rng.uniform(-5, 5, (n, 3)),
+        alpha=np.radians(90.0 * (np.arange(n) * 4 // n)),
+        ball_id=np.arange(n) % balls,
+    )
+
+
+def tilted_scan(T_HT: RigidTransform, *, n: int = 180) -> PoseSequence:
+    """The paper's 3D scan: eq. (10) with the triangle wave of eq. (11), 8 deg."""
+    alpha = np.arange(n) * 2 * np.pi / n
+    tilt = 28 / 45 * np.abs((alpha + np.pi / 14) % (2 * np.pi / 7) - np.pi / 7) - 2 * np.pi / 45
+    turn = R_z(alpha)
+    R = T_HT.R.T @ np.swapaxes(turn, 1, 2) @ R_y(tilt) @ turn @ T_HT.R
+    return PoseSequence(
+        T_MH=RigidTransform(R=R, t=np.zeros((n, 3)), source=Frame.M, target=Frame.H),
+        pose_id=tuple(str(k) for k in range(n)), alpha=alpha,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """What a run needs and what is true: machine as it is believed, poses, observations, scan and its true matrices."""
+
+    machine: Any
+    poses: PoseSequence
+    observations: BallObservations
+    scan: PoseSequence
+    P_true: Any
+    points: Any
+    scanner: Scanner
+
+
+def experiment(
+    machine: Any, p: Any, poses: PoseSequence, scan: PoseSequence, *, T_HT: RigidTransform, balls: Any,
+    rng: np.random.Generator, believed: Any = None, disturbance: Disturbance | None = None, scanner: Scanner = SCANNER,
+    scan_disturbed: bool = False, centre: Any = (0.0, 0.0, 0.0),
+) -> Experiment:
+    """Image the balls on the real machine; the scan is executed by the same machine."""
+    disturbance = disturbance or Disturbance()
+    real = real_motion(machine, poses, p, disturbance=disturbance, rng=rng)
+    x = project_ball(
+        scanner, T_HT=T_HT, T_MH=real.T_MH, t=np.asarray(balls)[np.asarray(poses.ball_id)], alpha=poses.alpha
+    )
+    sigma = DETECTION_PX / np.sqrt(2)
+    observations = BallObservations.from_sigma(
+        x + sigma * rng.standard_normal(x.shape), sigma, pose_id=poses.pose_id
+    )
+    scanned = real_motion(machine, scan, p, disturbance=disturbance if scan_disturbed else None, rng=rng)
+    home = scanner.T_TW(0.0) @ T_HT
+    return Experiment(
+        machine=machine if believed is None else believed, poses=poses, observations=observations, scan=scan,
+        P_true=eq5_matrices(scanner, T_HT=T_HT, T_MH=scanned.T_MH, alpha=scan.alpha),
+        points=home.R @ np.asarray(centre) + home.t + object_points() if np.any(centre) else object_points(),
+        scanner=scanner,
+    )
+
+
+def hexapod_experiment(
+    machine: Any, kind: str, seed: int, *, size: float = 1.0, balls: int = 1, geometry: float = 1.0,
+    disturbance: Disturbance | None = None, scan_disturbed: bool = False,
+) -> Experiment:
+    """kind: "paper" or "mixed"; geometry: factor on the file's joints; size: factor on the joint errors."""
+    rng = np.random.default_rng(np.random.SeedSequence([5, seed]))
+    T_HT = RigidTransform.from_angles(
+        np.array([0.0, 0.0, np.pi]) + 0.02 * rng.standard_normal(3), rng.uniform(-3, 3, 3), source=Frame.H,
+        target=Frame.T,
+    )
+    p = size * rng.standard_normal(len(machine.names)) * machine.sigma
+    poses = paper_poses() if kind == "paper" else mixed_poses(rng, balls=balls)
+    centres = np.array([[12.0, -14.0, 10.0], [-10.0, 12.0, -15.0]])[:balls]
+    if kind == "paper":
+        centres = np.array([[3.0, -2.0, 5.0]])
+    believed = replace(
+        machine, base_joints=geometry * machine.base_joints, platform_joints=geometry * machine.platform_joints
+    )
+    return experiment(
+        machine, p, poses, tilted_scan(T_HT), T_HT=T_HT, balls=centres, rng=rng, believed=believed,
+        disturbance=disturbance, scan_disturbed=scan_disturbed,
+    )
+
+
+def robot_experiment(robot: Any, seed: int, *, n: int = 200) -> Experiment:
+    """The object on a robot's flange: n joint configurations around the working one, then a tilted scan by joint moves."""
+    rng = np.random.default_rng(np.random.SeedSequence([6, seed]))
+    p = rng.standard_normal(len(robot.names)) * robot.sigma
+    centre = robot.forward(robot.q_start[None])
+    # the working point lies at the W origin
+    T_HT = RigidTransform.from_angles([0.01, -0.02, np.pi], np.zeros(3), source=Frame.H, target=Frame.T)
+    T_HT = replace(T_HT, t=-(T_HT.R @ centre.t[0]))
+    t = np.array([[12.0, -14.0, 40.0]])
+    q = robot.inverse(
+        RigidTransform(
+            R=centre.R[0] @ R_z(rng.uniform(-2.9, 2.9, n)) @ R_y(np.radians(rng.uniform(-15, 15, n))),
+            t=centre.t[0] + rng.uniform(-15, 15, (n, 3)), source=Frame.M, target=Frame.H,
+        )
+    )
+    poses = poses_from_joints(robot, q)
+    angle = np.linspace(-2.9, 2.9, 180)
+    q_scan = robot.inverse(
+        RigidTransform(
+            R=centre.R[0] @ R_z(angle) @ R_y(np.radians(8) * np.sin(7 * angle)), t=np.tile(centre.t, (180, 1)),
+            source=Frame.M, target=Frame.H,
+        )
+    )
+    scan = poses_from_joints(robot, q_scan)
+    return experiment(robot, p, poses, scan, T_HT=T_HT, balls=t, rng=rng, centre=(0, 0, 0))
+
+
+def trajectory_error(calibration: Calibration, e: Experiment) -> tuple[float, float, float]:
+    """(rms error px, rms of the stated uncertainty px, share of coordinates inside 95 %) of the scan's points."""
+    P = projection_matrices(calibration, e.scan).P
+    d = without_object_pose(P, e.P_true, e.points)
+    sigma = trajectory_sigma(calibration, e.scan, e.points)
+    return rms_px(d), float(np.sqrt(np.mean(np.sum(sigma**2, axis=-1)))), float(np.mean(np.abs(d) < 1.96 * sigma))
+
+
+def run(e: Experiment, model: str) -> Calibration:
+    return calibrate(e.scanner, e.poses, e.observations, manipulator=e.machine, model=model)

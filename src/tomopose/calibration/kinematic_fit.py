@@ -1,0 +1,162 @@
+"""One model, fitted honestly: rows that do not belong set aside, scatter and size of the errors taken from the data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.special import chdtri
+
+from tomopose.calibration.kinematic_solve import KinematicProblem, MapEstimate, State, linearise, solve_map
+from tomopose.calibration.residuals import whiteners
+from tomopose.calibration.robust import LARGEST_SHARE, MEDIAN_CHI2_2, RECLASSIFICATIONS, limit
+from tomopose.calibration.uncertainty import WIDENING_PROBABILITY
+from tomopose.errors import NotConvergedError
+from tomopose.units import Array
+
+SCATTER_STEPS = 12
+SCATTER_TOLERANCE = 0.02
+LARGEST_SCATTER = 1e10
+REWEIGHTINGS = 15
+SIZE_STEPS = 4
+SMALLEST_SIZE, LARGEST_SIZE = 1e-3, 30.0
+SIZE_GAIN = 3.0
+"""Natural log units of evidence that another size of the errors must gain over the stated one to be believed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelFit:
+    """A model's optimum and how it was reached.
+
+    keep (n,) bool: rows used, of all rows.  distance2 (n,): squared studentised residuals of all rows.
+    size: factor on the stated standard deviations of the errors.
+    """
+
+    estimate: MapEstimate
+    keep: Any
+    distance2: Array
+    size: float = 1.0
+
+    @property
+    def scatter(self) -> float:
+        return self.estimate.problem.scatter
+
+
+def distances(estimate: MapEstimate, whole: KinematicProblem, keep: Any) -> Array:
+    """(n,) squared residuals of all rows in their own predicted standard deviations; rows not kept are predictions."""
+    at = linearise(replace(whole, weight=None), estimate.state)
+    W = whiteners(at.C)
+    WJ = W @ at.J
+    spread = WJ @ estimate.covariance @ np.swapaxes(WJ, 1, 2)
+    value, Q = np.linalg.eigh(np.eye(2) + np.where(keep[:, None, None], -spread, spread))
+    z = (np.swapaxes(Q, 1, 2) @ (W @ at.r[:, :, None]))[..., 0]
+    d2: Array = (z**2 / np.maximum(value, 0.01)).sum(axis=1)
+    return d2
+
+
+def with_scatter(estimate: MapEstimate) -> MapEstimate:
+    """The estimate with the plate's scatter raised until chi2 is what right covariances leave; never lowered.
+
+    Scatter is raised only where chi2 lies above the value exceeded once in a hundred runs.
+    """
+    if estimate.dof <= 0 or estimate.chi2 <= chdtri(estimate.dof, WIDENING_PROBABILITY):
+        return estimate
+    if not estimate.problem.repeatability.variance.any():
+        return estimate
+    f, best = 1.0, estimate
+    low, high = 1.0, np.inf
+    for _ in range(SCATTER_STEPS):
+        ratio = best.chi2 / best.dof
+        if abs(ratio - 1) < SCATTER_TOLERANCE:
+            break
+        low, high = (max(low, f), high) if ratio > 1 else (low, min(high, f))
+        guess = f * ratio**1.5 if ratio > 1 else f * ratio
+        f = guess if low < guess < high else (np.sqrt(low * high) if np.isfinite(high) else f * 4)
+        if f > LARGEST_SCATTER:
+            break
+        best = solve_map(replace(best.problem, scatter=f), best.state)
+    return best
+
+
+def with_size(estimate: MapEstimate) -> tuple[MapEstimate, float]:
+    """The estimate with the prior's size taken from the data where that is clearly better than the stated one.
+
+    MacKay's rule: s^2 = sum (p/sigma)^2 / gamma, gamma the number of errors that the data determine.
+    """
+    model = estimate.problem.model
+    if model is None or not len(model.names):
+        return estimate, 1.0
+    m = len(model.names)
+    size, now = 1.0, estimate
+    for _ in range(SIZE_STEPS):
+        sigma = now.problem.prior_sigma[-m:]
+        gamma = m - float(np.sum(np.diag(now.covariance)[-m:] / sigma**2))
+        found = float(np.sqrt(np.sum((now.state.p / sigma) ** 2) / max(gamma, 1e-3)))
+        change = float(np.clip(size * found, SMALLEST_SIZE, LARGEST_SIZE)) / size
+        if abs(np.log(change)) < 0.1:
+            break
+        size *= change
+        now = solve_map(replace(now.problem, model=model.resized(size)), now.state)
+    return (now, size) if now.log_evidence > estimate.log_evidence + SIZE_GAIN else (estimate, 1.0)
+
+
+def fit_model(
+    problem: KinematicProblem, start: State, *, robust: bool = True, resize: bool = True, keep: Any = None
+) -> ModelFit:
+    """The optimum of a model from a start, with scatter and size from the data.
+
+    keep: (n,) rows to use; without it those that belong are found (robust) or all are used.
+    """
+    n = len(problem.poses)
+    given = keep is not None
+    keep = np.asarray(keep) if given else np.ones(n, dtype=bool)
+    estimate = solve_map(problem if keep.all() else problem.rows(keep), start)
+    if robust and not given:
+        d2 = distances(estimate, problem, keep)
+        if d2.max() > limit(n) * max(1.0, _scale(d2)):
+            estimate, keep = _without_outliers(problem, estimate)
+    estimate = with_scatter(estimate)
+    estimate, size = with_size(estimate) if resize else (estimate, 1.0)
+    whole = replace(problem, scatter=estimate.problem.scatter, model=estimate.problem.model)
+    return ModelFit(estimate=estimate, keep=keep, distance2=distances(estimate, whole, keep), size=size)
+
+
+def _scale(d2: Array) -> float:
+    return float(np.median(d2) / MEDIAN_CHI2_2)
+
+
+def _without_outliers(problem: KinematicProblem, first: MapEstimate) -> tuple[MapEstimate, Any]:
+    """The fit of the rows that belong; the first fit and all rows where no few outliers explain the misfit."""
+    n = len(problem.poses)
+    everything = np.ones(n, dtype=bool)
+    state, weight = first.state, np.ones(n)
+    try:
+        for _ in range(REWEIGHTINGS):
+            estimate = solve_map(replace(problem, weight=weight), state)
+            state = estimate.state
+            W = whiteners(estimate.at.C * weight[:, None, None])
+            d2 = ((W @ estimate.at.r[:, :, None])[..., 0] ** 2).sum(axis=1)
+            # Geman-McClure, whose influence falls to zero; the floor keeps every covariance finite
+            new = np.maximum((1.0 + d2 / (9.0 * max(1.0, _scale(d2)))) ** -2, 1e-12)
+            settled = np.abs(new - weight).max() < 1e-2
+            weight = new
+            if settled:
+                break
+        keep = d2 <= limit(n) * max(1.0, _scale(d2))
+        for _ in range(RECLASSIFICATIONS):
+            if keep.mean() < 1.0 - LARGEST_SHARE or not _every_ball(problem, keep):
+                break
+            estimate = solve_map(problem.rows(keep), state)
+            d2 = distances(estimate, problem, keep)
+            new_keep = d2 <= limit(n) * max(1.0, _scale(d2[keep]))
+            if (new_keep == keep).all():
+                return estimate, keep
+            keep, state = new_keep, estimate.state
+    except NotConvergedError:
+        pass
+    return first, everything
+
+
+def _every_ball(problem: KinematicProblem, keep: Any) -> bool:
+    return len(np.unique(problem.data.ball[keep])) == len(problem.data.ball_ids)
