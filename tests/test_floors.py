@@ -53,7 +53,7 @@ def test_the_library_neither_prints_nor_exits():
             if isinstance(node, ast.Call):
                 name = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
                 owner = getattr(getattr(node.func, "value", None), "id", "")
-                if name == "print" and isinstance(node.func, ast.Name) or (owner, name) == ("sys", "exit"):
+                if (name == "print" and isinstance(node.func, ast.Name)) or (owner, name) == ("sys", "exit"):
                     strays.append(f"{path.relative_to(SOURCE)}:{node.lineno}")
     assert strays == []
 
