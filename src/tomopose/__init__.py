@@ -24,6 +24,7 @@ _HOME = {
     "VoxelGrid": "tomopose.volume",
     "calibrate": "tomopose.calibration.solve",
     "detect": "tomopose.detection.detect",
+    "diagnose": "tomopose.calibration.hypotheses",
     "export": "tomopose.exports",
     "open_images": "tomopose.io",
     "pair_images": "tomopose.io",

@@ -23,6 +23,7 @@ VERBS = (
     "simulate",
     "detect",
     "calibrate",
+    "diagnose",
     "plan",
     "matrices",
     "export",
