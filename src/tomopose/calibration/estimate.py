@@ -107,14 +107,16 @@ def solve(
     if not np.isfinite(first.chi2):
         raise NotConvergedError("no start led to an optimum with the ball in front of the source in every pose")
     everything = np.ones(len(problem), dtype=bool)
-    require_observable(problem, free, jacobian(problem, free, blocks(problem, free, first)))
+    # judged by detection noise alone: pose noise as large as a mistake would hide behind "not observable"
+    if noise is None:
+        require_observable(problem, free, jacobian(problem, free, blocks(problem, free, first)))
     result = robust_fit(problem, free, first) if robust else RobustFit(
         fit=first, keep=everything, distance2=np.full(len(problem), np.nan), scale=np.nan, misfit=False
     )
     used = problem.select(result.keep)
     b = blocks(used, free, result.fit)
     J = jacobian(used, free, b)
-    if not result.keep.all():
+    if noise is None and not result.keep.all():
         require_observable(used, free, J)
     dof = 2 * len(used) + int((free.information > 0).sum()) - J.shape[2]
     if dof <= 0:

@@ -211,7 +211,7 @@ def _list() -> tuple[Rival, ...]:
         Rival(name="pose inverted", words="the poses map base to plate", cure=_POSES + "invert every pose",
               change=_inverse, quick=True),
         Rival(name="rotation inverted", words="only the rotations are transposed",
-              cure=_POSES + "transpose every rotation", change=_inverse_rotation),
+              cure=_POSES + "transpose every rotation", change=_inverse_rotation, quick=True),
         Rival(name="translation in the tool frame", words="translations run along the moved axes",
               cure=_POSES + "turn the translations by the pose's rotation", change=_tool_translation, quick=True),
         Rival(name="translation turned back", words="translations were written along fixed axes after turning",

@@ -82,9 +82,9 @@ def verdict(f: Findings) -> tuple[str, tuple[str, ...]]:
             "identify the manipulator's errors (--manipulator)"
         )
     if f.integrity:
-        doubtful += [
-            f"{e.words} (p = {e.p:.1g})" for e in f.integrity.effects if e.p < SIGNIFICANT and e.size_px > EFFECT_PX
-        ]
+        moved = [e for e in f.integrity.effects if e.p < SIGNIFICANT and e.size_px > EFFECT_PX]
+        steps = sorted((e for e in moved if e.at), key=lambda e: e.p)[:1]
+        doubtful += [f"{e.words} (p = {e.p:.1g})" for e in moved if not e.at or e in steps]
         doubtful += [
             f"pose {r['first']} taken again as {r['again']} is off by {r['distance_px']:.3g} px "
             f"({r['sigmas']:.1f} sigma)"
