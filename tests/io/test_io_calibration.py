@@ -21,8 +21,8 @@ from tomopose.trajectory.pose_grid import pose_grid
 KEPT = Path(__file__).parent / "files"
 INTERFACE = {
     "schema", "T_HT", "t_mm", "ball_ids", "parameters", "covariance", "d_rms_px", "d_rms_um", "dof", "chi2_dof",
-    "model", "manipulator", "observability", "hypotheses", "verdict", "reasons", "pivot_mm", "scanner", "residuals", "outliers",
-    "status", "provenance",
+    "model", "manipulator", "observability", "hypotheses", "verdict", "reasons", "pivot_mm", "scanner", "residuals",
+    "outliers", "status", "provenance",
 }
 
 
