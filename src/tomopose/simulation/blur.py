@@ -21,61 +21,55 @@ def margin(sigma: float) -> int:
 
 
 def pixel_kernel(sigma: float, f: int, half: int) -> Array:
-    r"""Weights ((2 half + 1) f,) of the cells around a pixel, f cells a pixel: box * Gaussian, integrated over each cell.
+    r"""Weights (2, (2 half + 1) f) with which a pixel takes the means and the slopes (per px) of the cells around it.
 
-    A cell's mean is spread evenly over the cell, which together with its taking has the variance h^2 / 6 (h = 1/f); the
-    Gaussian is made narrower by that, so that the blur's second moment is exact.
+    The pixel's response to light at distance x is k(x) = Phi((x + 1/2) / sigma) - Phi((x - 1/2) / sigma); a cell holds
+    m + s (x - x_c), so that its weights are the integrals of k and of (x - x_c) k over the cell.
     """
     h = 1.0 / f
-    s = math.sqrt(max(sigma**2 - h**2 / 6, 0.0))
-    x = (np.arange((2 * half + 1) * f) + 0.5) * h - half - 0.5
-
-    def twice_integrated(x: Array) -> Array:
-        if s == 0:
-            return np.maximum(x, 0.0)
-        return np.asarray(x * ndtr(x / s) + s * np.exp(-0.5 * (x / s) ** 2) / math.sqrt(2 * math.pi))
-
-    a, b = 0.5 + h / 2, 0.5 - h / 2
-    k = twice_integrated(x + a) - twice_integrated(x + b) - twice_integrated(x - b) + twice_integrated(x - a)
-    return np.asarray(k / k.sum())
+    centre = (np.arange((2 * half + 1) * f) + 0.5) * h - half - 0.5
+    node, weight = np.polynomial.legendre.leggauss(24)
+    x = centre[:, None] + node * (h / 2)
+    k = np.asarray(ndtr((x + 0.5) / sigma) - ndtr((x - 0.5) / sigma)) if sigma > 0 else (np.abs(x) < 0.5).astype(float)
+    k = k * weight * (h / 2)
+    kernel = np.stack([k.sum(axis=1), (k * node).sum(axis=1) * (h / 2)])
+    return np.asarray(kernel / kernel[0].sum())
 
 
 @njit(cache=True, nogil=True)
 def _reduce_rows(cells: Any, k: Any, f: int, half: int, j_0: int, j_1: int, out: Any) -> None:
-    n_v = cells.shape[0] // f
+    last = cells.shape[1] - 1
     for j in range(j_0, j_1):
-        out[j, :] = 0.0
-        for a in range(len(k)):
+        out[:, j, :] = 0.0
+        for a in range(k.shape[1]):
             row = (j - half) * f + a
-            row = min(max(row, 0), n_v * f - 1)
-            weight = k[a]
-            for i in range(cells.shape[1]):
-                out[j, i] += weight * cells[row, i]
+            row = min(max(row, 0), last)
+            k_0, k_1 = k[0, a], k[1, a]
+            for i in range(cells.shape[2]):
+                out[0, j, i] += k_0 * cells[0, row, i] + k_1 * cells[2, row, i]
+                out[1, j, i] += k_0 * cells[1, row, i] + k_1 * cells[3, row, i]
 
 
 @njit(cache=True, nogil=True)
 def _reduce_columns(rows: Any, k: Any, f: int, half: int, j_0: int, j_1: int, out: Any) -> None:
-    last = rows.shape[1] - 1
+    last = rows.shape[2] - 1
     for j in range(j_0, j_1):
         for i in range(out.shape[1]):
             total, start = 0.0, (i - half) * f
-            if start >= 0 and start + len(k) <= last + 1:
-                for a in range(len(k)):
-                    total += k[a] * rows[j, start + a]
-            else:
-                for a in range(len(k)):
-                    total += k[a] * rows[j, min(max(start + a, 0), last)]
+            for a in range(k.shape[1]):
+                column = min(max(start + a, 0), last)
+                total += k[0, a] * rows[0, j, column] + k[1, a] * rows[1, j, column]
             out[j, i] = total
 
 
 def to_pixels(cells: Array, *, f: int, sigma_u: float, sigma_v: float, threads: int = 1) -> Array:
-    """Pixel values (n_v, n_u) of cells (n_v f, n_u f) under a Gaussian blur of sigma_u, sigma_v px."""
+    """Pixel values (n_v, n_u) of cells (4, n_v f, n_u f; see `add_transmission`) under a Gaussian blur of sigma_u, sigma_v px."""
     from tomopose.simulation.projector import in_bands
 
-    n_v, n_u = cells.shape[0] // f, cells.shape[1] // f
+    n_v, n_u = cells.shape[1] // f, cells.shape[2] // f
     half_u, half_v = margin(sigma_u), margin(sigma_v)
-    k_u, k_v = pixel_kernel(sigma_u, f, half_u), pixel_kernel(sigma_v, f, half_v)
-    rows, out = np.empty((n_v, n_u * f)), np.empty((n_v, n_u))
-    in_bands(lambda lo, hi: _reduce_rows(cells, k_v, f, half_v, lo, hi, rows), n_v, threads)
-    in_bands(lambda lo, hi: _reduce_columns(rows, k_u, f, half_u, lo, hi, out), n_v, threads)
+    kernel_u, kernel_v = pixel_kernel(sigma_u, f, half_u), pixel_kernel(sigma_v, f, half_v)
+    rows, out = np.empty((2, n_v, n_u * f), dtype=np.float32), np.empty((n_v, n_u))
+    in_bands(lambda lo, hi: _reduce_rows(cells, kernel_v, f, half_v, lo, hi, rows), n_v, threads)
+    in_bands(lambda lo, hi: _reduce_columns(rows, kernel_u, f, half_u, lo, hi, out), n_v, threads)
     return out

@@ -3,7 +3,9 @@
 Rays go through the pixels' corners.  Where a pixel and its neighbours see the same surfaces and the transmission is
 smooth, its mean follows from the corners (bilinear with the curvature's correction).  Everywhere else the pixel is cut in
 f x f cells, and a cell with an edge is sampled at the points of a Fibonacci lattice, which no straight edge can follow.
-The result has f x f cells a pixel, so that blur acts before the pixel integrates, as it does in a scintillator.
+The result has f x f cells a pixel, so that blur acts before the pixel integrates, as it does in a scintillator; and each
+cell holds four numbers (mean, slope along u, slope along v, twist: the bilinear surface nearest to the transmission), so
+that an edge keeps its place inside its cell.
 """
 
 from __future__ import annotations
@@ -24,10 +26,14 @@ from tomopose.simulation.rays import LARGEST, Compiled, trace
 from tomopose.simulation.spectrum import Beam
 from tomopose.units import Array
 
-EDGE_POINTS, EDGE_STEP = 89, 55
-"""Fibonacci lattice of a cell with an edge: points (i / 89, 55 i / 89 mod 1)."""
-NEAR_POINTS, NEAR_STEP = 13, 8
-"""The same for a cell beside an edge."""
+LATTICES = ((5, 3), (13, 8), (34, 21), (89, 55))
+"""Fibonacci lattices (n, k) of a cell: points (i / n, k i / n mod 1)."""
+FLAT = 2e-3
+"""Differences of transmission over a cell below this need no lattice; above 4, 16, 64 times as much the finer ones."""
+OPAQUE = 30.0
+"""exp(-30) = 1e-13: nothing gets through."""
+STEPS = 128
+DECAY = np.exp(-np.arange(OPAQUE * STEPS + 1) / STEPS)
 SMOOTH = 2e-4
 """Largest third difference of transmission over the corners that counts as smooth."""
 
@@ -69,15 +75,29 @@ def in_bands(work: Callable[[int, int], None], n: int, threads: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _at(c: Any, w: Any, mu: Any, s: Any, O: Any, U: Any, V: Any, u: float, v: float, d: Any, T: Any, S: Any, L: Any) -> Any:
+def _work_space(c: Any, depth: int) -> Any:
+    """(T, S, L, active) for `trace`: each band of rows has its own."""
+    mu, boxes = c[10], c[15]
+    return (np.empty((depth + 3, LARGEST)), np.empty((depth + 3, LARGEST + 1), dtype=np.int64), np.empty(mu.shape[1]),
+            np.empty(len(boxes), dtype=np.bool_))
+
+
+@njit(cache=True, nogil=True)
+def _at(c: Any, work: Any, u: float, v: float) -> Any:
     """(transmission, signature) at pixel coordinates (u, v)."""
-    kind, p, R, t, ops, first, material, centre, radius = c
-    for k in range(3):
-        d[k] = O[k] + u * U[k] + v * V[k] - s[k]
-    length = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-    for k in range(3):
-        d[k] /= length
-    signature = trace(kind, p, R, t, ops, first, material, centre, radius, s, d, T, S, L)
+    kind, p, R, t, ops, first, material, centre, radius, w, mu, s, O, U, V, boxes = c
+    T, S, L, active = work
+    nothing = True
+    for k in range(len(active)):
+        active[k] = boxes[k, 0, 0] <= u <= boxes[k, 1, 0] and boxes[k, 0, 1] <= v <= boxes[k, 1, 1]
+        nothing = nothing and not active[k]
+    if nothing:
+        return 1.0, np.int64(0)
+    dx, dy, dz = (O[0] + u * U[0] + v * V[0] - s[0], O[1] + u * U[1] + v * V[1] - s[1],
+                  O[2] + u * U[2] + v * V[2] - s[2])
+    h = 1 / np.sqrt(dx * dx + dy * dy + dz * dz)
+    signature = trace(kind, p, R, t, ops, first, material, centre, radius, active, s[0], s[1], s[2], h * dx, h * dy,
+                      h * dz, T, S, L)
     if signature == 0:
         return 1.0, signature
     total = 0.0
@@ -85,21 +105,23 @@ def _at(c: Any, w: Any, mu: Any, s: Any, O: Any, U: Any, V: Any, u: float, v: fl
         x = 0.0
         for m in range(len(L)):
             x += mu[e, m] * L[m]
-        total += w[e] * np.exp(-x)
+        if x < OPAQUE:
+            # exp(-x) from a table and three terms of the series, to 2e-10.
+            k = int(x * STEPS)
+            r = x - k / STEPS
+            total += w[e] * DECAY[k] * (1 - r * (1 - r * (0.5 - r / 6)))
     return total, signature
 
 
 @njit(cache=True, nogil=True)
-def _corners(c: Any, w: Any, mu: Any, s: Any, O: Any, U: Any, V: Any, depth: int, u_0: int, v_0: int, mask: Any,
-             j_0: int, j_1: int, I: Any, seen: Any) -> bool:
-    T, S = np.empty((depth + 3, LARGEST)), np.empty((depth + 3, LARGEST + 1), dtype=np.int64)
-    L, d = np.empty(mu.shape[1]), np.empty(3)
+def _corners(c: Any, depth: int, u_0: int, v_0: int, mask: Any, j_0: int, j_1: int, I: Any, seen: Any) -> bool:
+    work = _work_space(c, depth)
     fine = True
     for j in range(j_0, j_1):
         for i in range(I.shape[1]):
             I[j, i], seen[j, i] = 1.0, 0
             if mask[j, i]:
-                I[j, i], seen[j, i] = _at(c, w, mu, s, O, U, V, u_0 + i - 0.5, v_0 + j - 0.5, d, T, S, L)
+                I[j, i], seen[j, i] = _at(c, work, u_0 + i - 0.5, v_0 + j - 0.5)
                 if seen[j, i] < 0:
                     fine = False
     return fine
@@ -126,13 +148,20 @@ def _smooth(I: Any, seen: Any, j: int, i: int) -> bool:
     return True
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _add(out: Any, row: int, column: int, m: float, m_u: float, m_v: float, m_uv: float) -> None:
+    out[0, row, column] += m
+    out[1, row, column] += m_u
+    out[2, row, column] += m_v
+    out[3, row, column] += m_uv
+
+
 @njit(cache=True, nogil=True)
-def _cells(c: Any, w: Any, mu: Any, s: Any, O: Any, U: Any, V: Any, depth: int, u_0: int, v_0: int, I: Any, seen: Any,
-           f: int, j_0: int, j_1: int, weight: float, out: Any) -> None:
-    """Add weight x (mean transmission of the f x f cells of the pixels in rows j_0 to j_1) to `out`."""
-    T, S = np.empty((depth + 3, LARGEST)), np.empty((depth + 3, LARGEST + 1), dtype=np.int64)
-    L, d = np.empty(mu.shape[1]), np.empty(3)
-    nodes, node_seen = np.empty((f + 1, f + 1)), np.empty((f + 1, f + 1), dtype=np.int64)
+def _cells(c: Any, depth: int, u_0: int, v_0: int, I: Any, seen: Any, f: int, j_0: int, j_1: int, weight: float, out: Any,
+           ) -> None:
+    """Add weight x moments of the f x f cells of the pixels in rows j_0 to j_1 to `out` (4, rows, columns)."""
+    work = _work_space(c, depth)
+    node, node_seen = np.empty((f + 1, f + 1)), np.empty((f + 1, f + 1), dtype=np.int64)
     h = 1.0 / f
     # Mean over cell b of x (1 - x) / 2: what bilinear interpolation between the corners misses per unit of curvature.
     bow = np.empty(f)
@@ -145,39 +174,59 @@ def _cells(c: Any, w: Any, mu: Any, s: Any, O: Any, U: Any, V: Any, depth: int, 
                 if seen[j, i] == 0:
                     for a in range(f):
                         for b in range(f):
-                            out[j * f + a, i * f + b] += weight
+                            out[0, j * f + a, i * f + b] += weight
                     continue
                 f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
                 I_uu = 0.5 * (I[j, i - 1] - f_00 - f_01 + I[j, i + 2] + I[j + 1, i - 1] - f_10 - f_11 + I[j + 1, i + 2]) / 2
                 I_vv = 0.5 * (I[j - 1, i] - f_00 - f_10 + I[j + 2, i] + I[j - 1, i + 1] - f_01 - f_11 + I[j + 2, i + 1]) / 2
+                twist = f_11 - f_10 - f_01 + f_00
                 for a in range(f):
                     y = (a + 0.5) * h
                     for b in range(f):
                         x = (b + 0.5) * h
-                        value = (1 - y) * ((1 - x) * f_00 + x * f_01) + y * ((1 - x) * f_10 + x * f_11)
-                        out[j * f + a, i * f + b] += weight * (value - bow[b] * I_uu - bow[a] * I_vv)
+                        I_u, I_v = f_01 - f_00 + y * twist, f_10 - f_00 + x * twist
+                        value = f_00 + x * (f_01 - f_00) + y * I_v - bow[b] * I_uu - bow[a] * I_vv
+                        _add(out, j * f + a, i * f + b, weight * value, weight * (I_u + (x - 0.5) * I_uu),
+                             weight * (I_v + (y - 0.5) * I_vv), weight * twist)
                 continue
             left, low = u_0 + i - 0.5, v_0 + j - 0.5
             for a in range(f + 1):
                 for b in range(f + 1):
                     if a in (0, f) and b in (0, f):
-                        node_seen[a, b] = seen[j + a // f, i + b // f]
+                        node[a, b], node_seen[a, b] = I[j + a // f, i + b // f], seen[j + a // f, i + b // f]
                     else:
-                        _, node_seen[a, b] = _at(c, w, mu, s, O, U, V, left + b * h, low + a * h, d, T, S, L)
+                        node[a, b], node_seen[a, b] = _at(c, work, left + b * h, low + a * h)
             for a in range(f):
                 for b in range(f):
-                    n, step = NEAR_POINTS, NEAR_STEP
+                    f_00, f_01, f_10, f_11 = node[a, b], node[a, b + 1], node[a + 1, b], node[a + 1, b + 1]
                     mark = node_seen[a, b]
-                    if node_seen[a + 1, b] != mark or node_seen[a, b + 1] != mark or node_seen[a + 1, b + 1] != mark:
-                        n, step = EDGE_POINTS, EDGE_STEP
-                    elif mark == 0:
-                        out[j * f + a, i * f + b] += weight
+                    same = mark == node_seen[a + 1, b] and mark == node_seen[a, b + 1] and mark == node_seen[a + 1, b + 1]
+                    if same and mark == 0:
+                        out[0, j * f + a, i * f + b] += weight
                         continue
-                    total = 0.0
+                    corners = (f_00 + f_01 + f_10 + f_11) / 4
+                    middle, _ = _at(c, work, left + (b + 0.5) * h, low + (a + 0.5) * h)
+                    span = max(f_00, f_01, f_10, f_11, middle) - min(f_00, f_01, f_10, f_11, middle)
+                    if span < FLAT or (same and abs(middle - corners) < FLAT):
+                        _add(out, j * f + a, i * f + b, weight * (2 * middle + corners) / 3,
+                             weight * f * (f_01 + f_11 - f_00 - f_10) / 2, weight * f * (f_10 + f_11 - f_00 - f_01) / 2,
+                             weight * f * f * (f_11 - f_10 - f_01 + f_00))
+                        continue
+                    which = 1 if span > 4 * FLAT else 0
+                    if span > 16 * FLAT:
+                        which = 2 if same or span < 64 * FLAT else 3
+                    n, step = LATTICES[which]
+                    m = m_u = m_v = m_uv = 0.0
                     for q in range(n):
                         x, y = (q + 0.5) / n, ((q * step) % n + 0.5) / n
-                        total += _at(c, w, mu, s, O, U, V, left + (b + x) * h, low + (a + y) * h, d, T, S, L)[0]
-                    out[j * f + a, i * f + b] += weight * total / n
+                        value, _ = _at(c, work, left + (b + x) * h, low + (a + y) * h)
+                        m += value
+                        m_u += value * (x - 0.5)
+                        m_v += value * (y - 0.5)
+                        m_uv += value * (x - 0.5) * (y - 0.5)
+                    # Slopes per pixel of the least-squares bilinear surface: 12 / h times the first moments.
+                    k = weight * 12 * f / n
+                    _add(out, j * f + a, i * f + b, weight * m / n, k * m_u, k * m_v, k * 12 * f * m_uv)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,20 +262,24 @@ def add_transmission(
     out: Array, window: Window, compiled: Compiled, beam: Beam, view: View, T_FW: dict[Frame, RigidTransform], *, f: int,
     weight: float = 1.0, threads: int = 1,
 ) -> None:
-    """Add weight x transmission to `out` (n_v f, n_u f), the cells of the window's pixels.
+    """Add weight x transmission to `out` (4, n_v f, n_u f), the cells of the window's pixels.
+
+    out[0]: mean; out[1], out[2]: slopes along u and v, per px; out[3]: twist, per px^2; float32.
 
     T_FW: each frame's transform to W.  Raises InputError where a ray crosses more surfaces than `LARGEST`.
     """
     R, t, centre = compiled.in_world(T_FW)
-    c = (compiled.kind, compiled.p, R, t, compiled.ops, compiled.first, compiled.material, centre, compiled.radius)
+    boxes = shadow_boxes(compiled, view, T_FW)
+    c = (compiled.kind, compiled.p, R, t, compiled.ops, compiled.first, compiled.material, centre, compiled.radius,
+         beam.w, beam.mu, view.source, view.O, view.U, view.V, boxes)
     I = np.empty((window.n_v + 1, window.n_u + 1))
     seen = np.empty(I.shape, dtype=np.int64)
     mask = np.zeros(I.shape, dtype=np.bool_)
-    for (u_lo, v_lo), (u_hi, v_hi) in shadow_boxes(compiled, view, T_FW):
+    for (u_lo, v_lo), (u_hi, v_hi) in boxes:
         j = slice(max(int(np.floor(v_lo)) - window.v_0, 0), max(int(np.ceil(v_hi)) - window.v_0 + 2, 0))
         i = slice(max(int(np.floor(u_lo)) - window.u_0, 0), max(int(np.ceil(u_hi)) - window.u_0 + 2, 0))
         mask[j, i] = True
-    common = (c, beam.w, beam.mu, view.source, view.O, view.U, view.V, compiled.depth, window.u_0, window.v_0)
+    common = (c, compiled.depth, window.u_0, window.v_0)
     fine = [True]
 
     def corners(lo: int, hi: int) -> None:

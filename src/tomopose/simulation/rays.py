@@ -109,9 +109,10 @@ def compile_solids(solids: list[Solid] | tuple[Solid, ...]) -> Compiled:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _put(t: Any, s: Any, t_0: float, t_1: float, s_0: int, s_1: int) -> int:
+def _put(T: Any, S: Any, row: int, t_0: float, t_1: float, s_0: int, s_1: int) -> int:
+    """Write one interval into a row of crossings; returns how many crossings that are (0 or 2)."""
     if t_1 > t_0:
-        t[0], t[1], s[0], s[1] = t_0, t_1, s_0, s_1
+        T[row, 0], T[row, 1], S[row, 0], S[row, 1] = t_0, t_1, s_0, s_1
         return 2
     return 0
 
@@ -159,8 +160,8 @@ def _root(c: Any, n: int, lo: float, hi: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _torus(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, ring: float, tube: float, t: Any, s: Any,
-           ) -> int:
+def _torus(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, ring: float, tube: float, T: Any, S: Any,
+           row: int) -> int:
     """Crossings of a torus, from an origin near it: the quartic's roots between its derivatives' roots."""
     b = ox * dx + oy * dy + oz * dz
     c = ox * ox + oy * oy + oz * oz - ring * ring - tube * tube
@@ -197,56 +198,59 @@ def _torus(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, rin
     if m % 2:
         m -= 1
     for j in range(m):
-        t[j], s[j] = roots[j], 0
+        T[row, j], S[row, j] = roots[j], 0
     return m
 
 
 @njit(cache=True, nogil=True)
-def _crossings(kind: int, p: Any, R: Any, c: Any, o: Any, d: Any, t: Any, s: Any) -> int:
-    """Crossings of one primitive: distances into t, faces into s; returns how many (even)."""
+def _crossings(kind: Any, p: Any, R: Any, c: Any, q: int, ox: float, oy: float, oz: float, dx: float, dy: float,
+               dz: float, T: Any, S: Any, row: int) -> int:
+    """Crossings of primitive q with the ray o + t d: into row `row` of T (distances) and S (faces); how many (even)."""
     # The ray's origin moves to the point nearest to the primitive's own origin; `shift` brings distances back.
-    ex, ey, ez = o[0] - c[0], o[1] - c[1], o[2] - c[2]
-    shift = -(ex * d[0] + ey * d[1] + ez * d[2])
-    ex, ey, ez = ex + shift * d[0], ey + shift * d[1], ez + shift * d[2]
+    ex, ey, ez = ox - c[q, 0], oy - c[q, 1], oz - c[q, 2]
+    shift = -(ex * dx + ey * dy + ez * dz)
+    ex, ey, ez = ex + shift * dx, ey + shift * dy, ez + shift * dz
     n = 0
-    if kind == 0:
-        inside = p[0] * p[0] - (ex * ex + ey * ey + ez * ez)
+    what, a, b = kind[q], p[q, 0], p[q, 1]
+    if what == 0:
+        inside = a * a - (ex * ex + ey * ey + ez * ez)
         if inside > 0:
             half = np.sqrt(inside)
-            n = _put(t, s, -half, half, 0, 0)
+            n = _put(T, S, row, -half, half, 0, 0)
     else:
-        ox = R[0, 0] * ex + R[1, 0] * ey + R[2, 0] * ez
-        oy = R[0, 1] * ex + R[1, 1] * ey + R[2, 1] * ez
-        oz = R[0, 2] * ex + R[1, 2] * ey + R[2, 2] * ez
-        dx = R[0, 0] * d[0] + R[1, 0] * d[1] + R[2, 0] * d[2]
-        dy = R[0, 1] * d[0] + R[1, 1] * d[1] + R[2, 1] * d[2]
-        dz = R[0, 2] * d[0] + R[1, 2] * d[1] + R[2, 2] * d[2]
-        if kind == 1:
-            n = _cylinder(ox, oy, oz, dx, dy, dz, p[0], p[1], t, s)
-        elif kind == 2:
-            n = _cone(ox, oy, oz, dx, dy, dz, p[0], p[1], p[2], t, s)
-        elif kind == 3:
-            lo, hi, s_lo, s_hi = _slab(ox, dx, p[0], 1, -FAR, FAR, 0, 0)
-            lo, hi, s_lo, s_hi = _slab(oy, dy, p[1], 3, lo, hi, s_lo, s_hi)
-            lo, hi, s_lo, s_hi = _slab(oz, dz, p[2], 5, lo, hi, s_lo, s_hi)
-            n = _put(t, s, lo, hi, s_lo, s_hi)
-        elif kind == 4:
-            if ex * ex + ey * ey + ez * ez < (p[0] + p[1]) ** 2:
-                n = _torus(ox, oy, oz, dx, dy, dz, p[0], p[1], t, s)
-        elif dz == 0.0:
-            n = _put(t, s, -FAR, FAR, 0, 0) if oz <= 0 else 0
-        elif dz > 0:
-            n = _put(t, s, -FAR, -oz / dz, 1, 0)
+        lx = R[q, 0, 0] * ex + R[q, 1, 0] * ey + R[q, 2, 0] * ez
+        ly = R[q, 0, 1] * ex + R[q, 1, 1] * ey + R[q, 2, 1] * ez
+        lz = R[q, 0, 2] * ex + R[q, 1, 2] * ey + R[q, 2, 2] * ez
+        gx = R[q, 0, 0] * dx + R[q, 1, 0] * dy + R[q, 2, 0] * dz
+        gy = R[q, 0, 1] * dx + R[q, 1, 1] * dy + R[q, 2, 1] * dz
+        gz = R[q, 0, 2] * dx + R[q, 1, 2] * dy + R[q, 2, 2] * dz
+        if what == 1:
+            n = _cylinder(lx, ly, lz, gx, gy, gz, a, b, T, S, row)
+        elif what == 2:
+            n = _cone(lx, ly, lz, gx, gy, gz, a, b, p[q, 2], T, S, row)
+        elif what == 3:
+            lo, hi, s_lo, s_hi = _slab(lx, gx, a, 1, -FAR, FAR, 0, 0)
+            lo, hi, s_lo, s_hi = _slab(ly, gy, b, 3, lo, hi, s_lo, s_hi)
+            lo, hi, s_lo, s_hi = _slab(lz, gz, p[q, 2], 5, lo, hi, s_lo, s_hi)
+            n = _put(T, S, row, lo, hi, s_lo, s_hi)
+        elif what == 4:
+            if ex * ex + ey * ey + ez * ez < (a + b) ** 2:
+                n = _torus(lx, ly, lz, gx, gy, gz, a, b, T, S, row)
+        elif gz == 0.0:
+            n = _put(T, S, row, -FAR, FAR, 0, 0) if lz <= 0 else 0
+        elif gz > 0:
+            n = _put(T, S, row, -FAR, -lz / gz, 1, 0)
         else:
-            n = _put(t, s, -oz / dz, FAR, 0, 1)
+            n = _put(T, S, row, -lz / gz, FAR, 0, 1)
     for k in range(n):
-        t[k] += shift
+        T[row, k] += shift
+        S[row, k] += 8 * q
     return n
 
 
 @njit(cache=True, nogil=True)
-def _cylinder(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, r: float, h: float, t: Any, s: Any,
-              ) -> int:
+def _cylinder(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, r: float, h: float, T: Any, S: Any,
+              row: int) -> int:
     a = dx * dx + dy * dy
     lo, hi = -FAR, FAR
     if a < 1e-28:
@@ -262,12 +266,12 @@ def _cylinder(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, 
         half = np.sqrt(inside / a)
         lo, hi = k - half, k + half
     lo, hi, s_lo, s_hi = _slab(oz, dz, h, 1, lo, hi, 0, 0)
-    return _put(t, s, lo, hi, s_lo, s_hi)
+    return _put(T, S, row, lo, hi, s_lo, s_hi)
 
 
 @njit(cache=True, nogil=True)
-def _cone(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, r: float, h: float, slope: float, t: Any,
-          s: Any) -> int:
+def _cone(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, r: float, h: float, slope: float, T: Any,
+          S: Any, row: int) -> int:
     """Truncated cone, radius r + slope z for |z| <= h: convex, so one interval at most."""
     lo, hi, s_lo, s_hi = _slab(oz, dz, h, 1, -FAR, FAR, 0, 0)
     if not hi > lo:
@@ -279,16 +283,16 @@ def _cone(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, r: f
     c = ox * ox + oy * oy - rho * rho
     if abs(a) < 1e-14:
         if b == 0.0:
-            return _put(t, s, lo, hi, s_lo, s_hi) if c < 0 else 0
+            return _put(T, S, row, lo, hi, s_lo, s_hi) if c < 0 else 0
         root = -c / (2 * b)
         if b > 0 and root < hi:
             hi, s_hi = root, 0
         elif b < 0 and root > lo:
             lo, s_lo = root, 0
-        return _put(t, s, lo, hi, s_lo, s_hi)
+        return _put(T, S, row, lo, hi, s_lo, s_hi)
     disc = b * b - a * c
     if disc <= 0:
-        return 0 if a > 0 else _put(t, s, lo, hi, s_lo, s_hi)
+        return 0 if a > 0 else _put(T, S, row, lo, hi, s_lo, s_hi)
     q = -(b + np.sqrt(disc)) if b > 0 else -b + np.sqrt(disc)
     t_0, t_1 = q / a, c / q if q != 0.0 else 0.0
     if t_0 > t_1:
@@ -298,50 +302,50 @@ def _cone(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, r: f
             lo, s_lo = t_0, 0
         if t_1 < hi:
             hi, s_hi = t_1, 0
-        return _put(t, s, lo, hi, s_lo, s_hi)
+        return _put(T, S, row, lo, hi, s_lo, s_hi)
     # a < 0: inside before t_0 and after t_1; the nappe with positive radius is the one that meets |z| <= h.
     if drho > 0:
         if t_1 > lo:
             lo, s_lo = t_1, 0
     elif t_0 < hi:
         hi, s_hi = t_0, 0
-    return _put(t, s, lo, hi, s_lo, s_hi)
+    return _put(T, S, row, lo, hi, s_lo, s_hi)
 
 
 @njit(cache=True, nogil=True)
-def _combine(ta: Any, sa: Any, na: int, tb: Any, sb: Any, nb: int, op: int, t: Any, s: Any) -> int:
-    """Merge two crossing lists into that of their union (-1), intersection (-2) or difference (-3); -1 if too long."""
+def _combine(T: Any, S: Any, a: int, na: int, b: int, nb: int, op: int, out: int) -> int:
+    """Merge rows a and b of crossings into row `out`: union (-1), intersection (-2) or difference (-3); -1 if too long."""
     i = j = n = 0
     in_a = in_b = inside = False
     while i < na or j < nb:
-        if j >= nb or (i < na and ta[i] <= tb[j]):
-            at, face = ta[i], sa[i]
+        if j >= nb or (i < na and T[a, i] <= T[b, j]):
+            at, face = T[a, i], S[a, i]
             in_a = not in_a
             i += 1
         else:
-            at, face = tb[j], sb[j]
+            at, face = T[b, j], S[b, j]
             in_b = not in_b
             j += 1
         now = (in_a or in_b) if op == -1 else ((in_a and in_b) if op == -2 else (in_a and not in_b))
         if now != inside:
             inside = now
-            if n > 0 and t[n - 1] == at:
+            if n > 0 and T[out, n - 1] == at:
                 n -= 1
             else:
                 if n >= LARGEST:
                     return -1
-                t[n], s[n] = at, face
+                T[out, n], S[out, n] = at, face
                 n += 1
     return n
 
 
 @njit(cache=True, nogil=True)
-def trace(kind: Any, p: Any, R: Any, c: Any, ops: Any, first: Any, material: Any, centre: Any, radius: Any, o: Any, d: Any,
-          T: Any, S: Any, L: Any) -> Any:
+def trace(kind: Any, p: Any, R: Any, c: Any, ops: Any, first: Any, material: Any, centre: Any, radius: Any, active: Any,
+          ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, T: Any, S: Any, L: Any) -> Any:
     """Path lengths of one ray, per material, into L (mm); returns the ray's signature, or -1 where a list overflowed.
 
-    o, d: origin and unit direction in W.  T (depth + 3, LARGEST), S (depth + 3, LARGEST + 1) int64: work space.  The signature numbers the
-    surfaces crossed in their order: two rays with the same one are joined by a smooth change of path.
+    active (m,): which solids can be met at all.  o, d: origin and unit direction.  T (depth + 3, LARGEST), S (the same, one column more) int64: work space.  The
+    signature numbers the surfaces crossed in their order: rays that share it are joined by a smooth change of path.
     """
     for m in range(len(L)):
         L[m] = 0.0
@@ -350,38 +354,45 @@ def trace(kind: Any, p: Any, R: Any, c: Any, ops: Any, first: Any, material: Any
     taken, other, n_taken = T.shape[0] - 2, T.shape[0] - 3, 0
     # Later solids displace earlier ones: walk backwards and keep what is taken already.
     for k in range(len(first) - 2, -1, -1):
-        ex, ey, ez = centre[k, 0] - o[0], centre[k, 1] - o[1], centre[k, 2] - o[2]
-        along = ex * d[0] + ey * d[1] + ez * d[2]
-        ex, ey, ez = ex - along * d[0], ey - along * d[1], ez - along * d[2]
-        if ex * ex + ey * ey + ez * ez >= radius[k] * radius[k]:
+        if not active[k]:
             continue
-        top = 0
-        n_now = 0
+        ex, ey, ez = centre[k, 0] - ox, centre[k, 1] - oy, centre[k, 2] - oz
+        along = ex * dx + ey * dy + ez * dz
+        if ex * ex + ey * ey + ez * ez - along * along >= radius[k] * radius[k] * (1 + 1e-9) + 1e-9:
+            continue
+        top = n_now = 0
         for q in range(first[k], first[k + 1]):
             op = ops[q]
             if op >= 0:
-                n_now = _crossings(kind[op], p[op], R[op], c[op], o, d, T[top], S[top])
-                for e in range(n_now):
-                    S[top, e] += 8 * op
+                n_now = _crossings(kind, p, R, c, op, ox, oy, oz, dx, dy, dz, T, S, top)
                 S[top, LARGEST] = n_now
                 top += 1
+                continue
+            top -= 1
+            n_a, n_b = S[top - 1, LARGEST], S[top, LARGEST]
+            n_now = n_a
+            if n_b == 0:
+                if op == -2:
+                    n_now = 0
+            elif n_a == 0:
+                if op == -1:
+                    n_now = n_b
+                    for e in range(n_b):
+                        T[top - 1, e], S[top - 1, e] = T[top, e], S[top, e]
             else:
-                n_a, n_b = S[top - 2, LARGEST], S[top - 1, LARGEST]
-                n_now = _combine(T[top - 2], S[top - 2], n_a, T[top - 1], S[top - 1], n_b, op, T[spare], S[spare])
+                n_now = _combine(T, S, top - 1, n_a, top, n_b, op, spare)
                 if n_now < 0:
                     return np.int64(-1)
                 for e in range(n_now):
-                    T[top - 2, e], S[top - 2, e] = T[spare, e], S[spare, e]
-                S[top - 2, LARGEST] = n_now
-                top -= 1
+                    T[top - 1, e], S[top - 1, e] = T[spare, e], S[spare, e]
+            S[top - 1, LARGEST] = n_now
         if n_now == 0:
             continue
         row, n_row = 0, n_now
         if n_taken > 0:
-            n_row = _combine(T[0], S[0], n_now, T[taken], S[taken], n_taken, -3, T[spare], S[spare])
+            row, n_row = spare, _combine(T, S, 0, n_now, taken, n_taken, -3, spare)
             if n_row < 0:
                 return np.int64(-1)
-            row = spare
         path = 0.0
         for e in range(0, n_row, 2):
             path += max(T[row, e + 1], 0.0) - max(T[row, e], 0.0)
@@ -389,7 +400,7 @@ def trace(kind: Any, p: Any, R: Any, c: Any, ops: Any, first: Any, material: Any
             signature = (signature * np.int64(1000003) + S[row, e] + 1) & np.int64(0x7FFFFFFFFFFF)
         L[material[k]] += path
         if k > 0:
-            n_taken = _combine(T[0], S[0], n_now, T[taken], S[taken], n_taken, -1, T[other], S[other])
+            n_taken = _combine(T, S, 0, n_now, taken, n_taken, -1, other)
             if n_taken < 0:
                 return np.int64(-1)
             taken, other = other, taken
@@ -400,8 +411,10 @@ def trace(kind: Any, p: Any, R: Any, c: Any, ops: Any, first: Any, material: Any
 def _trace_all(kind: Any, p: Any, R: Any, c: Any, ops: Any, first: Any, material: Any, centre: Any, radius: Any, o: Any,
                d: Any, depth: int, L: Any) -> int:
     T, S = np.empty((depth + 3, LARGEST)), np.empty((depth + 3, LARGEST + 1), dtype=np.int64)
+    active = np.ones(len(material), dtype=np.bool_)
     for i in range(len(d)):
-        if trace(kind, p, R, c, ops, first, material, centre, radius, o[i], d[i], T, S, L[i]) < 0:
+        if trace(kind, p, R, c, ops, first, material, centre, radius, active, o[i, 0], o[i, 1], o[i, 2], d[i, 0], d[i, 1],
+                 d[i, 2], T, S, L[i]) < 0:
             return i
     return -1
 

@@ -114,7 +114,7 @@ def transmission(run: SimulatedRun, i: int, *, threads: int = 1) -> Array:
     if window is None:
         return out
     f = detector.cells
-    cells = np.zeros((window.n_v * f, window.n_u * f))
+    cells = np.zeros((4, window.n_v * f, window.n_u * f), dtype=np.float32)
     add_transmission(cells, window, run.compiled, run.beam, view, T_FW, f=f, threads=threads)
     pixels = to_pixels(cells, f=f, sigma_u=sigma_u, sigma_v=sigma_v, threads=threads)
     v_0, u_0 = max(window.v_0, 0), max(window.u_0, 0)
