@@ -305,6 +305,11 @@ def test_a_gap_in_the_numbering_is_refused_unless_the_ids_have_it_too():
     assert pair_images(poses(ids), names).tolist() == list(range(11))
 
 
+def test_times_in_names_are_no_running_number():
+    names = [f"im_2026112210{k:04d}.tif" for k in (3, 10, 17, 4000)]
+    assert pair_images(poses(["a", "b", "c", "d"]), names).tolist() == [0, 1, 2, 3]
+
+
 def test_a_gap_in_a_folder_is_noted(folder):
     (folder / "pose_2.tif").unlink()
     assert "leaves out 1 numbers, the first is 2" in open_images(folder).warnings[0]

@@ -345,8 +345,10 @@ def test_positions_that_look_like_micrometres_are_asked_about(table):
 
 
 def test_encoder_noise_about_zero_is_no_unit_error(table):
-    noise = f"{HEAD}\n0,0.00013,-0.0004,0.0021,0,5.00002,0\n1,-0.0009,0.00007,0.0011,0,-4.9999,0\n"
-    assert len(read_poses(table(noise))) == 2
+    tilted = f"{HEAD}\n0,0.00013,-0.0004,0.0021,0,5.00002,0\n1,-0.0009,0.00007,0.0011,0,-4.9999,0\n"
+    assert len(read_poses(table(tilted))) == 2
+    circular = f"{HEAD}\n0,0.00013,-0.0004,0.0021,0.0001,0.0003,0\n1,-0.0009,0.00007,0.0011,0,-0.0004,0\n"
+    assert len(read_poses(table(circular))) == 2
 
 
 @pytest.mark.parametrize("alphas", [("0", "1.5707963"), ("0.7854", "3.1416")])

@@ -19,8 +19,8 @@ SMALLEST_PLAN_DEG = 0.2
 WHOLE_DEGREE_TOLERANCE = 0.005
 """Degrees; four digits after the point of a number in radians."""
 LARGEST_ORIENTATION_DEG = 360.0
-ENCODER_NOISE_MM = 0.005
-"""Read-outs around a commanded zero stay below this; a plan in metres lies above."""
+ENCODER_NOISE_MM, ENCODER_NOISE_DEG = 0.005, 0.002
+"""Read-outs around a commanded zero stay below these; plans in metres and radians lie above."""
 SMALLEST_PLAN_MM = 0.05
 LARGEST_POSITION_MM = 5000.0
 ONE_TURN = 2 * math.pi
@@ -33,7 +33,7 @@ def require_degrees(angles: Array, where: str) -> None:
     largest = _largest(angles)
     if largest > LARGEST_ORIENTATION_DEG:
         raise UnitError(f"{where}: an angle of {largest:g} is no orientation in degrees; {TABLE_CURE}")
-    if 0 < largest < SMALLEST_PLAN_DEG or _whole_degrees_in_radians(angles):
+    if ENCODER_NOISE_DEG <= largest < SMALLEST_PLAN_DEG or _whole_degrees_in_radians(angles):
         raise UnitError(
             f"{where}: the angles look like radians (largest {largest:g}, which is {math.degrees(largest):.4g} deg "
             f"if it is rad), but the columns are in degrees; convert them, or {TABLE_CURE}"

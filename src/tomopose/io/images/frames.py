@@ -97,6 +97,10 @@ def numbers_in_names(names: tuple[str, ...]) -> list[int] | None:
     return [int(p[varying[0]]) for p in parts]
 
 
+MOST_MISSING = 3
+"""A series that leaves out more than this many numbers for each one there is no running number."""
+
+
 def missing_numbers(names: tuple[str, ...]) -> list[int]:
     """Numbers that a numbered series leaves out, by its commonest step; empty where nothing is missing or numbered."""
     numbers = numbers_in_names(names)
@@ -107,5 +111,7 @@ def missing_numbers(names: tuple[str, ...]) -> list[int]:
         return []
     values, counts = np.unique(steps, return_counts=True)
     step = int(values[counts.argmax()])
+    if (max(numbers) - min(numbers)) // step > MOST_MISSING * len(numbers):
+        return []  # times or serial numbers, which count nothing
     present = set(numbers)
     return [k for k in range(min(numbers), max(numbers), step) if k not in present]
