@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exports_cases import TOLERANCE_PX, circular_matrices, pixels, points, random_matrices
+from exports_cases import TOLERANCE_PX, circular_matrices, matrices_of, pixels, points, random_matrices
+from scipy.spatial.transform import Rotation
 
 from tomopose.exports import export, read_geometry
 from tomopose.exports.ctsimu_scenario import from_ctsimu
@@ -247,6 +248,36 @@ def test_we_read_what_rtk_writes(matrices, folder, tmp_path):
     writer.WriteFile()
     back = read_geometry(tmp_path / "theirs.xml", side=folder / "rtk.json")
     np.testing.assert_allclose(back.project(X), matrices.project(X), rtol=0, atol=TOLERANCE_PX)
+
+
+def test_rtk_draws_a_sphere_where_the_matrices_put_it(tmp_path):
+    """Through RTK's own ray tracer: origin, spacing, axes and row order of rtk.json, not only the matrices."""
+    rtk, itk = rtk_module(), package("itk")
+    rng = np.random.default_rng(4)
+    matrices = matrices_of(
+        Rotation.random(4, random_state=rng).as_matrix(), np.tile([400.0, 1000.0], (4, 1)),
+        np.hstack([rng.uniform(-3, 3, (4, 2)), rng.uniform(-5, 5, (4, 2))]), n_u=61, n_v=55, p_u=1.0, p_v=1.25,
+    )
+    export(matrices, tmp_path / "out", formats="rtk")
+    side = json.loads((tmp_path / "out" / "rtk.json").read_text())
+    reader = rtk.ThreeDCircularProjectionGeometryXMLFileReader.New()
+    reader.SetFilename(str(tmp_path / "out" / "rtk.xml"))
+    reader.GenerateOutputInformation()
+    stack = itk.image_from_array(np.zeros((len(matrices), matrices.n_v, matrices.n_u), np.float32))
+    stack.SetOrigin([*side["origin"], 0.0])
+    stack.SetSpacing([*side["spacing"], 1.0])
+    centre, radius = np.array([2.0, -1.0, 3.0]), 3.0
+    draw = rtk.RayEllipsoidIntersectionImageFilter.New(stack)
+    draw.SetGeometry(reader.GetOutputObject())
+    draw.SetDensity(1.0)
+    draw.SetAxis([radius] * 3)
+    draw.SetCenter([float(x) for x in np.array(side["world_to_rtk"]) @ centre])
+    draw.Update()
+    shadow = itk.array_from_image(draw.GetOutput())
+    v, u = np.mgrid[: matrices.n_v, : matrices.n_u]
+    middle = np.stack([(u * shadow).sum((1, 2)), (v * shadow).sum((1, 2))], axis=-1) / shadow.sum((1, 2))[:, None]
+    # The centroid of a round shadow of some 20 pixels; a slip of half a pixel or a wrong row order cannot hide here.
+    np.testing.assert_allclose(middle, matrices.project(centre[None])[:, 0], rtol=0, atol=0.1)
 
 
 # -- astra-toolbox ---------------------------------------------------------------------------------------------------

@@ -258,6 +258,75 @@ def test_npz_files_may_be_json_with_the_same_keys(bare, matrices):
         assert_same(read_geometry(bare / f"{name}.json", rows="bottom", **options(matrices)), matrices)
 
 
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [({"n_u": 0}, "n_u is 0"), ({"n_u": 10.5}, "n_u is 10.5"), ({"n_v": -3}, "n_v is -3"), ({"p_u": 0.0}, "p_u is 0.0"),
+     ({"p_v": np.nan}, "p_v is nan"), ({"p_v": np.inf}, "p_v is inf")],
+)
+@pytest.mark.parametrize("format", ["pyronn", "astra", "openct"])
+def test_options_that_make_no_sense(format, given, words, bare, matrices):
+    with pytest.raises(InputError, match=words):
+        read_geometry(bare / MAIN_FILE[format], rows="bottom", **{**options(matrices), **given})
+
+
+WRONG = (None, "x", 0, -1, [], {}, True, [1, 2, 3], {"value": None}, 1e-300, [[]], "nan", float("inf"))
+
+
+def damage_json(content, rng):
+    """Another value, or none, in one random place."""
+    places = []
+
+    def walk(node, place):
+        places.append(place)
+        items = node.items() if isinstance(node, dict) else enumerate(node[:4]) if isinstance(node, list) else ()
+        for key, child in items:
+            walk(child, [*place, key])
+
+    walk(content, [])
+    *parents, last = places[rng.integers(1, len(places))]
+    for key in parents:
+        content = content[key]
+    if rng.random() < 0.2:
+        del content[last]
+    else:
+        content[last] = WRONG[rng.integers(len(WRONG))]
+
+
+def damage_bytes(whole, rng):
+    data = bytearray(whole)
+    for _ in range(rng.integers(1, 4)):
+        at = rng.integers(0, len(data))
+        if rng.random() < 0.5:
+            data[at] = rng.integers(32, 127)
+        else:
+            del data[at : at + rng.integers(1, 60)]
+    return bytes(data)
+
+
+@pytest.mark.parametrize("file", [*MAIN_FILE.values(), "cera_projtable.txt", "rtk.json"])
+def test_damage_is_an_error_of_the_tree_or_a_whole_geometry(file, bare, matrices):
+    """Whatever stands in a file: never another exception, never a number that is not finite, never fewer views."""
+    rng = np.random.default_rng(len(file))
+    path, whole = bare / file, (bare / file).read_bytes()
+    main = bare / {"cera_projtable.txt": "cera.config", "rtk.json": "rtk.xml"}.get(file, file)
+    format = next(name for name, f in MAIN_FILE.items() if f == main.name)
+    refused = 0
+    for _ in range(60):
+        if path.suffix == ".json" and rng.random() < 0.8:
+            path.write_bytes(whole)
+            edit(path, lambda content: damage_json(content, rng))
+        else:
+            path.write_bytes(damage_bytes(whole, rng))
+        side = bare / "rtk.json" if format == "rtk" else None
+        try:
+            back = read_geometry(main, format=format, rows="bottom", side=side, **options(matrices))
+        except TomoposeError:
+            refused += 1
+        else:
+            assert np.isfinite(back.P).all()
+    assert refused > 5
+
+
 # -- rtk -------------------------------------------------------------------------------------------------------------
 
 

@@ -165,6 +165,17 @@ def test_a_failing_write_leaves_nothing_behind(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_sizes_may_be_numpy_numbers(tmp_path):
+    """As they come out of an npz; a text file must not say np.float64(0.2)."""
+    plain = random_matrices(24)
+    matrices = replace(plain, n_u=np.int64(301), n_v=np.float64(257), p_u=np.float64(0.2), p_v=np.float32(0.25))
+    export(matrices, tmp_path / "out")
+    for name, definition in DEFINITIONS.items():
+        np.testing.assert_allclose(
+            definition(tmp_path / "out", X), plain.project(X), rtol=0, atol=TOLERANCE_PX, err_msg=name
+        )
+
+
 def test_json_files_are_strict_json(tmp_path):
     export(random_matrices(23), tmp_path / "out")
     for path in (tmp_path / "out").glob("*.json"):

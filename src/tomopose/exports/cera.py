@@ -46,14 +46,14 @@ def to_cera(
     Any matrix fits, skewed and mirrored ones too; what CERA makes of those is not known.  `date`: stands in the table;
     now where it is not given.
     """
-    n = len(matrices)
+    n, p_u, p_v = len(matrices), float(matrices.p_u), float(matrices.p_v)
     config = f"""#CERACONFIG
 
 [Projections]
-NumChannelsPerRow = {matrices.n_u}
-NumRows = {matrices.n_v}
-PixelSizeU = {matrices.p_u!r}
-PixelSizeV = {matrices.p_v!r}
+NumChannelsPerRow = {int(matrices.n_u)}
+NumRows = {int(matrices.n_v)}
+PixelSizeU = {p_u!r}
+PixelSizeV = {p_v!r}
 Rotation = None
 FlipU = false
 FlipV = {"true" if image_rows == "top" else "false"}

@@ -39,7 +39,10 @@ def from_cil(content: Mapping[str, Any], given: Given, *, where: str = "the CIL 
     if str(content["origin"]) not in ORIGINS.values():
         raise InputError(f"{where}: origin is {content['origin']!s}; known are {', '.join(ORIGINS.values())}")
     source, detector, x, y = (numbers(content[k], (-1, 3), f"{where}: {k}") for k in KEYS[:4])
-    x, y = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (x, y))
+    lengths = [np.linalg.norm(d, axis=1, keepdims=True) for d in (x, y)]
+    if min(length.min(initial=1.0) for length in lengths) == 0:
+        raise InputError(f"{where}: a direction has length 0")
+    x, y = x / lengths[0], y / lengths[1]
     size = numbers(content["num_pixels"], (2,), f"{where}: num_pixels")
     pitch = numbers(content["pixel_size"], (2,), f"{where}: pixel_size")
     settled = Given(

@@ -41,7 +41,8 @@ def from_ctsimu(content: Mapping[str, Any], given: Given, *, where: str = "the C
     n = n.get("value") if isinstance(n, Mapping) else n
     if isinstance(n, bool) or not isinstance(n, int) or n < 1:
         raise InputError(f"{where}: acquisition.number_of_projections is {n!r}; a positive whole number is needed")
-    for axis, factor in (acquisition.get("pixel_binning") or {}).items():
+    binning = {} if acquisition.get("pixel_binning") is None else _section(acquisition, "pixel_binning", where)
+    for axis, factor in binning.items():
         if (factor.get("value") if isinstance(factor, Mapping) else factor) not in (None, 1):
             raise InputError(f"{where}: acquisition.pixel_binning.{axis} is {factor!r}; only unbinned scans are read")
     geometry, detector = _section(content, "geometry", where), _section(content, "detector", where)
@@ -123,8 +124,7 @@ def _part(geo: Mapping[str, Any], n: int, where: str, turn: Array | None) -> _Po
     if turn is not None:
         axes = axes @ R_z(turn)
     pose = _Pose(centre=np.repeat(base[None], n, axis=0), axes=axes)
-    deviations = geo.get("deviations") or []
-    for k, deviation in enumerate([deviations] if isinstance(deviations, Mapping) else deviations):
+    for k, deviation in enumerate(_list(geo.get("deviations"), f"{where}.deviations")):
         pose = _deviate(pose, deviation, n, f"{where}.deviations[{k}]")
     return _Pose(centre=pose.centre + drift, axes=pose.axes)
 
@@ -188,16 +188,15 @@ def _values(json: Any, n: int, kind: str, where: str) -> tuple[float, Array]:
     _known(json, ("value", "unit", "drifts"), where)
     value = float(numbers(json.get("value"), (), where)) * _unit(json, kind, where, zero=json.get("value") == 0)
     total = np.zeros(n)
-    drifts = json.get("drifts") or []
-    for k, drift in enumerate([drifts] if isinstance(drifts, Mapping) else drifts):
+    for k, drift in enumerate(_list(json.get("drifts"), f"{where}.drifts")):
         place = f"{where}.drifts[{k}]"
         _known(drift, ("value", "unit", "known_to_reconstruction", "file"), place)
         if not _is_known(drift, place):
             continue
         if drift.get("value") is None:
             raise InputError(f"{place} keeps its values in the file {drift.get('file')!r}; put them into 'value'")
-        steps = np.atleast_1d(np.asarray(drift["value"]))
-        steps = numbers(steps, (-1,), place) * _unit({"unit": json.get("unit"), **drift}, kind, place, zero=False)
+        factor = _unit({"unit": json.get("unit"), **drift}, kind, place, zero=False)
+        steps = factor * numbers(_list(drift["value"], place, alone=(int, float)), (-1,), place)
         if not len(steps):
             raise InputError(f"{place} has no values")
         # One scan long, whatever the number of values; a scan of one frame takes the first.
@@ -219,7 +218,7 @@ def _unit(json: Mapping[str, Any], kind: str, where: str, *, zero: bool) -> floa
     unit = json.get("unit") or ""
     if kind and not unit and zero:
         return 1.0
-    if unit not in UNITS[kind]:
+    if not isinstance(unit, str) or unit not in UNITS[kind]:
         known = ", ".join(u for u in UNITS[kind] if u) or "no unit"
         raise UnitError(f"{where}: unit is {unit or 'missing'!r}; needed is one of: {known}")
     return UNITS[kind][unit]
@@ -230,6 +229,15 @@ def _is_known(json: Mapping[str, Any], where: str) -> bool:
     if known not in (None, True, False):
         raise InputError(f"{where}.known_to_reconstruction is {known!r}; true or false is needed")
     return known is not False
+
+
+def _list(json: Any, where: str, *, alone: Any = Mapping) -> list[Any]:
+    """A list, of one where a single entry of that kind stands alone; none at all is an empty list."""
+    if json is None or isinstance(json, list):
+        return json or []
+    if isinstance(json, alone):
+        return [json]
+    raise InputError(f"{where} is {json!r}; a list is needed")
 
 
 def _known(json: Any, keys: Sequence[str], where: str) -> None:
@@ -252,7 +260,7 @@ def _check_version(content: Mapping[str, Any], where: str) -> None:
     file = _section(content, "file", where)
     if file.get("file_type") != "CTSimU Scenario":
         raise InputError(f"{where}: file.file_type is {file.get('file_type')!r}, not 'CTSimU Scenario'")
-    version = file.get("file_format_version") or {}
+    version = _section(file, "file_format_version", f"{where}: file")
     found = (version.get("major"), version.get("minor"))
     if not all(isinstance(x, int) for x in found) or not (1, 0) <= found <= NEWEST:
         raise SchemaVersionError(f"{where}: file format {found[0]}.{found[1]}; 1.0 to 1.2 are read")

@@ -88,7 +88,7 @@ def from_openct(content: Mapping[str, Any], given: Given, *, where: str = "the o
     length = _part(content, "units", where).get("length")
     if length != "Millimeter":
         raise UnitError(f"{where}: units.length is {length!r}; 'Millimeter' is read")
-    projections, geometry = _part(content, "projections", where), content.get("geometry") or {}
+    projections, geometry = _part(content, "projections", where), _part(content, "geometry", where, needed=False)
     if geometry.get("mirrorDetectorAxis"):
         raise InputError(
             f"{where}: mirrorDetectorAxis is {geometry['mirrorDetectorAxis']!r}; whether the matrices mean the images "
@@ -99,7 +99,7 @@ def from_openct(content: Mapping[str, Any], given: Given, *, where: str = "the o
         raise InputError(f"{where} holds no projections.matrices; a circular scan given by angles alone is not read")
     P = numbers(table, (-1, 3, 4), f"{where}: projections.matrices")
     announced = projections.get("numProjections")
-    files = (projections.get("images") or {}).get("files")
+    files = _part(projections, "images", where, needed=False).get("files")
     # A file that lists no images may leave the count at 0; any other count must be that of the matrices.
     if announced not in (None, len(P)) and not (announced == 0 and not files):
         raise InputError(f"{where}: numProjections is {announced!r} but there are {len(P)} matrices")
@@ -108,7 +108,7 @@ def from_openct(content: Mapping[str, Any], given: Given, *, where: str = "the o
     if size is not None:
         n_u, n_v = (int(n) for n in numbers(size, (2,), f"{where}: detectorPixel"))
         found |= {"n_u": n_u, "n_v": n_v}
-        if geometry.get("detectorSize") is not None:
+        if min(n_u, n_v) > 0 and geometry.get("detectorSize") is not None:
             w, h = numbers(geometry["detectorSize"], (2,), f"{where}: detectorSize")
             found |= {"p_u": float(w) / n_u, "p_v": float(h) / n_v}
     values = {k: given.settle(k, found.get(k), where) for k in ("n_u", "n_v", "p_u", "p_v")}
@@ -119,8 +119,10 @@ def from_openct(content: Mapping[str, Any], given: Given, *, where: str = "the o
     return given.matrices(np.linalg.inv(A) @ P, **values)
 
 
-def _part(content: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
+def _part(content: Mapping[str, Any], name: str, where: str, *, needed: bool = True) -> Mapping[str, Any]:
     part = content.get(name)
+    if part is None and not needed:
+        return {}
     if not isinstance(part, Mapping):
         raise InputError(f"{where} lacks the section {name!r}")
     return part

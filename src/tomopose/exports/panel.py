@@ -55,10 +55,13 @@ class Given:
         given = getattr(self, name)
         if found is None and given is None:
             raise InputError(f"{where} does not hold {name}; give {name} ({OPTIONS[name]})")
+        if name != "rows":
+            for value, source in ((found, f" in {where}"), (given, "")):
+                _require_sensible(name, value, source)
         if found is None:
             return given
         if given is not None:
-            same = abs(found / given - 1) <= PITCH_TOLERANCE if name in ("p_u", "p_v") else found == given
+            same = abs(found - given) <= PITCH_TOLERANCE * given if name in ("p_u", "p_v") else found == given
             if not same:
                 raise InputError(f"{name} is {found!r} in {where}, but {given!r} was given ({OPTIONS[name]})")
         return found
@@ -67,6 +70,16 @@ class Given:
         """The result of a reader, with the views' names where they are known, 0 ... n-1 otherwise."""
         names = self.pose_id or tuple(str(k) for k in range(len(P)))
         return ProjectionMatrices(P=P, n_u=n_u, n_v=n_v, p_u=p_u, p_v=p_v, pose_id=names)
+
+
+def _require_sensible(name: str, value: Any, source: str) -> None:
+    """InputError for a size that is no positive whole number and a pitch that is no positive number."""
+    if value is None:
+        return
+    whole = name in ("n_u", "n_v")
+    if not (np.isfinite(value) and value > 0) or (whole and value != int(value)):
+        needed = "whole number of pixels" if whole else "number of millimetres"
+        raise InputError(f"{name} is {value!r}{source}; a positive {needed} is needed")
 
 
 def panels(matrices: ProjectionMatrices, format: str) -> ViewGeometry:

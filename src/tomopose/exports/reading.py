@@ -8,11 +8,10 @@ the format does not hold them; a missing one is an error that names the option, 
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PureWindowsPath
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -110,15 +109,12 @@ def _load(path: Path) -> Any:
         with open(path, "rb") as stream:
             head = stream.read(6)
             stream.seek(0)
-            if head == b"\x93NUMPY":
-                return np.load(stream, allow_pickle=False)
-            if head[:4] == b"PK\x03\x04":
-                with np.load(stream, allow_pickle=False) as archive:
-                    return {key: archive[key] for key in archive.files}
+            if head == b"\x93NUMPY" or head[:4] == b"PK\x03\x04":
+                return _arrays(stream, path)
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise FileError(f"{path} cannot be read: {error.strerror or error}", path=path) from error
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+    except UnicodeDecodeError as error:
         raise FileError(f"{path} is damaged or of another kind: {error}", path=path) from error
     if not text.lstrip().startswith("{"):
         return text
@@ -126,6 +122,14 @@ def _load(path: Path) -> Any:
         return json.loads(text)
     except json.JSONDecodeError as error:
         raise FileError(f"{path} is no whole JSON: {error}; is the file truncated?", path=path) from error
+
+
+def _arrays(stream: BinaryIO, path: Path) -> Any:
+    try:
+        loaded = np.load(stream, allow_pickle=False)
+        return loaded if isinstance(loaded, np.ndarray) else {key: loaded[key] for key in loaded.files}
+    except Exception as error:  # what NumPy's and zip's parsers raise on damaged bytes has no common class
+        raise FileError(f"{path} is damaged: {error}", path=path) from error
 
 
 def _format_of(content: Any) -> str | None:

@@ -57,10 +57,11 @@ def from_tigre(content: Mapping[str, Any], given: Given, *, where: str = "the TI
     """Matrices of `to_tigre`'s fields.  Array row 0 is the bottom; another row order contradicts the format."""
     require_keys(content, KEYS, where)
     for name in ("offOrigin", "COR"):
-        if np.any(np.asarray(content[name], dtype=np.float64) != 0):
+        if numbers(np.ravel(content[name]), (-1,), f"{where}: {name}").any():
             raise InputError(f"{where}: {name} is not 0; shift the geometry instead, tilted scans cannot use it")
-    DSO, DSD = (numbers(content[k], (-1,), f"{where}: {k}") for k in ("DSO", "DSD"))
+    DSO = numbers(content["DSO"], (-1,), f"{where}: DSO")
     n = len(DSO)
+    DSD = numbers(content["DSD"], (n,), f"{where}: DSD")
     angles, r = (numbers(content[k], (n, 3), f"{where}: {k}") for k in ("angles", "rotDetector"))
     offset = numbers(content["offDetector"], (n, 2), f"{where}: offDetector")
     size = numbers(content["nDetector"], (2,), f"{where}: nDetector")
