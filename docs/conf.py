@@ -9,7 +9,7 @@ import tomopose
 
 project = "tomopose"
 author = "The tomopose developers"
-copyright = "The tomopose developers"  # noqa: A001  (Sphinx asks for this name)
+copyright = "The tomopose developers"
 release = version = tomopose.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
@@ -18,8 +18,7 @@ myst_heading_anchors = 3
 root_doc = "index"
 exclude_patterns = ["_build", "changelog.d", "**/README.md"]
 autodoc_member_order = "bysource"
-autodoc_typehints = "signature"
-python_maximum_signature_line_length = 100
+autodoc_typehints = "none"  # the docstrings give shapes, units and frames
 add_module_names = False
 
 html_theme = "furo"
@@ -61,6 +60,13 @@ def keep_docstrings_as_written(app: object, what: str, name: str, value: object,
         lines += [".. code-block:: text", "", *(f"   {line}" for line in rest.rstrip().splitlines()), ""]
 
 
+def plain_defaults(app: object, what: str, name: str, value: object, options: object, signature: str | None,
+                   returned: str | None) -> tuple[str, str | None] | None:
+    """Defaults that are made anew for each object, as three dots."""
+    return None if signature is None else (signature.replace("<factory>", "..."), returned)
+
+
 def setup(app: object) -> None:
     app.connect("builder-inited", write_reference)  # type: ignore[attr-defined]
+    app.connect("autodoc-process-signature", plain_defaults)  # type: ignore[attr-defined]
     app.connect("autodoc-process-docstring", keep_docstrings_as_written)  # type: ignore[attr-defined]

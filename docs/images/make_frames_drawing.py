@@ -17,7 +17,7 @@ FOLDER = Path(__file__).parent
 INK, SOFT, PALE = "#1d2733", "#5b6775", "#c9d3dd"
 AXES = ("#b2433f", "#2b7d4f", "#1f5f99")
 FONT = 'font-family="Helvetica, Arial, DejaVu Sans, sans-serif"'
-SCALE, WIDTH, HEIGHT = 56.0, 1000, 560
+SCALE = 56.0
 MIDDLE = np.array([405.0, 235.0])
 
 # Seen from +y, a little from the source's side and from above: the source stands left, the detector right.
@@ -127,17 +127,19 @@ def frames_drawing() -> str:
         symbol = f"d<tspan dy='4' font-size='10'>{words}</tspan>"
         parts.append(text(symbol, middle, shift=(0, -6), colour=SOFT, size=15))
         parts += [path([[x, 0, -0.2], [x, 0, below - 0.15]], colour=PALE, width=1, dash="2 3") for x in (5.2, far)]
-    return svg(parts, WIDTH, HEIGHT, "The six frames: source S, world W, table T, base H, plate M, detector D")
+    title = "The six frames: source S, world W, table T, base H, plate M, detector D"
+    return svg(parts, title, left=80, top=18, width=810, height=510)
 
 
-def svg(parts: list[str], width: int, height: int, title: str) -> str:
+def svg(parts: list[str], title: str, *, left: int = 0, top: int = 0, width: int, height: int) -> str:
     heads = "".join(
         f'<marker id="{name}" viewBox="0 0 10 10" refX="8" refY="5" markerWidth="6" markerHeight="6" '
         f'orient="auto-start-reverse"><path d="M0,0.6L10,5L0,9.4Z" fill="{colour}"/></marker>'
         for name, colour in (("head0", AXES[0]), ("head1", AXES[1]), ("head2", AXES[2]), ("headS", SOFT))
     )
-    return (f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" role="img">'
-            f'<title>{title}</title><defs>{heads}</defs><rect width="{width}" height="{height}" fill="#ffffff"/>'
+    return (f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{left} {top} {width} {height}" role="img">'
+            f'<title>{title}</title><defs>{heads}</defs>'
+            f'<rect x="{left}" y="{top}" width="{width}" height="{height}" fill="#ffffff"/>'
             + "\n".join(parts) + "</svg>\n")
 
 
@@ -178,7 +180,7 @@ def detector_drawing() -> str:
             words(x0 + 2.1 * cell, y0 - 4, "u", AXES[0])
             words(x0 + 11, y0 - 1.85 * cell, "v", AXES[1])
             words(left + n_u * cell / 2, bottom + 26, "numbers are u, v; (0, 0) is the centre of a pixel", SOFT, 13)
-    return svg(parts, 870, 275, "Pixel coordinates of the frame D beside the rows of an image file")
+    return svg(parts, "Pixel coordinates of the frame D beside the rows of an image file", width=870, height=275)
 
 
 if __name__ == "__main__":
