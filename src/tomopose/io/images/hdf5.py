@@ -94,7 +94,7 @@ def open_hdf5(path: Path, name: str, dataset: str | None) -> Hdf5Source:
 
 
 def _stacks(file: Any) -> list[str]:
-    """The names of all three-dimensional datasets."""
+    """The names of all three-dimensional datasets; one that several links lead to is named once."""
     found: list[str] = []
 
     def visit(name: str, item: Any) -> None:
@@ -107,13 +107,11 @@ def _stacks(file: Any) -> list[str]:
 
 def _only(path: Path, file: Any, stacks: list[str]) -> str:
     """The stack of NXtomo, or the only one there is."""
-    nexus = [s for s in stacks if _key_beside(file, s) is not None]
-    # NXtomo links entry/data/data to entry/instrument/detector/data: two names of one stack.
-    places = {file[s].id.__hash__(): s for s in (nexus or stacks)}
-    if len(places) == 1:
-        return next(iter(places.values()))
+    candidates = [s for s in stacks if _key_beside(file, s) is not None] or stacks
+    if len(candidates) == 1:
+        return candidates[0]
     raise InputError(
-        f"{path} holds {len(places)} stacks of images ({', '.join(stacks) or 'none'}); name one with dataset="
+        f"{path} holds {len(candidates)} stacks of images ({', '.join(candidates) or 'none'}); name one with dataset="
     )
 
 

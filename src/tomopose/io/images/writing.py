@@ -12,6 +12,9 @@ from tomopose.files import atomic_file, require_absent
 from tomopose.io.images.frames import Image
 from tomopose.io.images.sequence import Rows
 
+CHUNK_ROWS = 64
+"""So that a small region costs a small read."""
+
 
 def file_rows(image: Image, rows: Rows) -> Image:
     """image[v, u] in the row order of a file, or back."""
@@ -49,7 +52,7 @@ def write_hdf5(
             if stack is None:
                 stack = file.create_dataset(
                     dataset, shape=(0, *image.shape), maxshape=(None, *image.shape), dtype=image.dtype,
-                    chunks=(1, *image.shape),
+                    chunks=(1, min(CHUNK_ROWS, image.shape[0]), image.shape[1]),
                 )
                 stack.attrs["image_rows"] = rows
             if image.shape != stack.shape[1:]:
