@@ -18,11 +18,13 @@ def register(app: typer.Typer) -> None:
 
 def import_geometry(
     file: Annotated[
-        Path, typer.Argument(help="RTK .xml, ASTRA vectors .npy, CERA .config, openCT or CTSimU .json.")
+        Path,
+        typer.Argument(help="RTK .xml, ASTRA .npy, CERA .config or table, openCT or CTSimU .json, leap, tigre, cil or "
+                       "pyronn .npz, or an export folder."),
     ],
     out: Annotated[Path, typer.Option("--out", help="matrices.npz to write.")],
     format: Annotated[
-        str | None, typer.Option("--format", help="rtk, astra, cera, openct or ctsimu, where the file does not say.")
+        str | None, typer.Option("--format", help="Where the file does not say: rtk, astra, cera, openct, ctsimu, leap, tigre, cil, pyronn.")
     ] = None,
     n_u: Annotated[int | None, typer.Option("--n-u-px", help="Detector width, px.")] = None,
     n_v: Annotated[int | None, typer.Option("--n-v-px", help="Detector height, px.")] = None,
@@ -47,9 +49,9 @@ def import_geometry(
     matrices = tp.read_geometry(
         file, format=format, n_u=n_u, n_v=n_v, p_u=p_u, p_v=p_v, rows=order, side=side
     )
-    made = provenance(
-        inputs=[file, *([side] if side else [])], arguments=arguments(format=format, n_u=n_u, n_v=n_v, rows=rows)
-    )
+    source = file / "manifest.json" if file.is_dir() else file
+    given = arguments(format=format, n_u=n_u, n_v=n_v, rows=rows)
+    made = provenance(inputs=[source, *([side] if side else [])], arguments=given)
     tp.write_matrices(out, matrices, provenance=made, force=force)
     say.result(
         {"out": out.name, "views": len(matrices), "n_u_px": matrices.n_u, "n_v_px": matrices.n_v},
