@@ -24,7 +24,9 @@ def import_geometry(
     ],
     out: Annotated[Path, typer.Option("--out", help="matrices.npz to write.")],
     format: Annotated[
-        str | None, typer.Option("--format", help="Where the file does not say: rtk, astra, cera, openct, ctsimu, leap, tigre, cil, pyronn.")
+        str | None,
+        typer.Option("--format", help="Where the file does not say: rtk, astra, cera, openct, ctsimu, leap, tigre, "
+                     "cil, pyronn."),
     ] = None,
     n_u: Annotated[int | None, typer.Option("--n-u-px", help="Detector width, px.")] = None,
     n_v: Annotated[int | None, typer.Option("--n-v-px", help="Detector height, px.")] = None,
