@@ -200,6 +200,10 @@ def change(path: Path, **changes: object) -> None:
         ({"p_u": -0.1}, InputError, "a positive pitch is needed"),
         ({"P": np.zeros((2, 3))}, InputError, r"\(n, 3, 4\)"),
         ({"pose_id": np.array(["a"])}, InputError, "56 matrices but 1 pose ids"),
+        ({"scanner": "{"}, FileError, "damaged"),
+        ({"scanner": "5"}, FileError, "damaged"),
+        ({"scanner": "{}"}, InputError, "scanner: d_SD_mm, .* missing"),
+        ({"n_u": np.array([1, 2])}, FileError, "damaged"),
     ],
 )
 def test_matrices_that_do_not_fit_are_refused(tmp_path, matrices, changes, error, message):

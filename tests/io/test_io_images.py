@@ -199,6 +199,15 @@ def test_the_third_party_radiographs_are_read(shared_data):
     assert pair_images(read_poses(data / "poses.csv"), images).tolist() == list(range(56))
 
 
+def test_folders_may_have_umlauts_and_blanks(tmp_path, stack):
+    place = tmp_path / "Prüf körper [1]"
+    write_tiff(place / "größe 1.tif", stack[0])
+    write_hdf5(place / "ü.h5", stack[:2])
+    check(open_images(place / "ü.h5"), stack[:2])
+    (place / "ü.h5").unlink()
+    check(open_images(place), stack[:1])
+
+
 def test_files_without_suffix_are_known_by_their_content(tmp_path, stack):
     write_tiff(tmp_path / "a.tif", stack[0])
     (tmp_path / "a.tif").rename(tmp_path / "a")

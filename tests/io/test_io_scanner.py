@@ -135,6 +135,26 @@ def test_impossible_values_are_named(file, changes, message):
         read_scanner(file(**changes))
 
 
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.sampled_from([*KNOWN[:-1], "voltage"]),
+    st.recursive(
+        st.none() | st.booleans() | st.integers(-(10**400), 10**400) | st.floats() | st.text(max_size=3),
+        lambda inner: st.lists(inner, max_size=2) | st.dictionaries(st.text(max_size=3), inner, max_size=2),
+        max_leaves=3,
+    ),
+)
+def test_no_value_makes_the_reader_fail_otherwise_than_on_purpose(tmp_path, key, value):
+    path = tmp_path / "scanner.json"
+    path.write_text(json.dumps(GOOD | {key: value}))
+    found: object = None
+    try:
+        found = read_scanner(path)
+    except (InputError, FileError) as error:
+        found = str(error)
+    assert isinstance(found, Scanner) or str(path) in str(found)
+
+
 def test_a_newer_or_foreign_schema_is_refused(file):
     with pytest.raises(SchemaVersionError, match="schema version 2 is newer than 1"):
         read_scanner(file(schema="tomopose/scanner/2"))

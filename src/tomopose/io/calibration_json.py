@@ -112,7 +112,7 @@ def read_calibration(path: str | Path) -> Calibration:
         raise InputError(f"{path}: the key {error} is missing") from error
     except InputError as error:
         raise error if str(error).startswith(str(path)) else InputError(f"{path}: {error}") from error
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
         raise FileError(f"{path} is damaged: {error}", path=path) from error
 
 

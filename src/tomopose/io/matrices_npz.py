@@ -63,10 +63,10 @@ def read_matrices(path: str | Path) -> ProjectionMatrices:
     missing = [key for key in REQUIRED if key not in content]
     if missing:
         raise InputError(f"{path}: {', '.join(missing)} missing")
-    scanner = None
-    if "scanner" in content:
-        scanner = scanner_from_document(json.loads(str(content["scanner"])), f"{path}: scanner")
     try:
+        scanner = None
+        if "scanner" in content:
+            scanner = scanner_from_document(json.loads(str(content["scanner"])), "scanner")
         return ProjectionMatrices(
             P=content["P"],
             n_u=int(content["n_u"]),
@@ -79,6 +79,8 @@ def read_matrices(path: str | Path) -> ProjectionMatrices:
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    except (TypeError, ValueError, AttributeError) as error:
+        raise FileError(f"{path} is damaged: {error}", path=path) from error
 
 
 def read_matrices_provenance(path: str | Path) -> Provenance | None:

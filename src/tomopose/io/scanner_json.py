@@ -125,8 +125,12 @@ def _required_keys() -> list[str]:
 def _number(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(f"{where} is {value!r}; a number is needed")
-    if not math.isfinite(value):
-        raise InputError(f"{where} is {value}, not a finite number")
+    try:
+        finite = math.isfinite(value)
+    except OverflowError:  # JSON knows whole numbers of any length
+        finite = False
+    if not finite:
+        raise InputError(f"{where} is {str(value)[:20]}, not a finite number")
     return value
 
 
