@@ -13,6 +13,7 @@ from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.report import coverage_figures, residual_figures, scene_figures
+from tomopose.report.checks_section import checks_section
 from tomopose.report.gather import Joined, join
 from tomopose.report.page import (
     BAD,
@@ -70,6 +71,7 @@ def calibration_report(
     HTML text; it loads nothing from a network.  Parts that were not given are named as such.
     """
     joined = join(calibration, observations=observations, poses=poses)
+    checks = checks_section(calibration)
     n, left = len(calibration.pose_id), len(calibration.outliers)
     sections = [
         _parameters(calibration),
@@ -78,7 +80,7 @@ def calibration_report(
         _observability(calibration),
         _coverage(calibration, joined, observations),
         _scene(calibration, joined, scan),
-        *_models(calibration),
+        *([checks] if checks is not None else []),
         provenance_section(calibration.provenance),
     ]
     page = Page(
@@ -344,32 +346,3 @@ def _scene(calibration: Calibration, joined: Joined, scan: ProjectionMatrices | 
                                             "uncertainty."]))
     return Section(title="In space", lead="The geometry as calibrated; drag to turn, scroll to come nearer.",
                    blocks=[b for b in blocks if b is not None])
-
-
-def _models(calibration: Calibration) -> list[Section]:
-    """Tables of what else the calibration holds, such as a comparison of models or held-out poses."""
-    blocks: list[Block] = []
-    for key, value in calibration.extra.items():
-        rows = _rows(value)
-        if rows:
-            columns = list(dict.fromkeys(c for row in rows for c in row))
-            blocks.append(
-                Table(
-                    title=heading(key).capitalize(), meaning="", columns=[heading(c) for c in columns],
-                    rows=[[cell(row.get(c)) for c in columns] for row in rows], folded=len(rows) > 20,
-                )
-            )
-    if not blocks:
-        return []
-    return [Section(title="Models and checks", lead="Further results of the same data.", blocks=blocks)]
-
-
-def _rows(value: Any) -> list[Mapping[str, Any]]:
-    """A nested value as the rows of a table."""
-    if isinstance(value, Mapping):
-        if value and all(isinstance(v, Mapping) for v in value.values()):
-            return [{"name": k, **v} for k, v in value.items()]
-        return [{"name": heading(str(k)), "value": v} for k, v in value.items()]
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [v if isinstance(v, Mapping) else {"value": v} for v in value]
-    return [{"value": value}]
