@@ -70,9 +70,12 @@ class Experiment:
 def experiment(
     machine: Any, p: Any, poses: PoseSequence, scan: PoseSequence, *, T_HT: RigidTransform, balls: Any,
     rng: np.random.Generator, believed: Any = None, disturbance: Disturbance | None = None, scanner: Scanner = SCANNER,
-    scan_disturbed: bool = False, centre: Any = (0.0, 0.0, 0.0),
+    scan_disturbed: bool = False, centre: Any = None,
 ) -> Experiment:
-    """Image the balls on the real machine; the scan is executed by the same machine."""
+    """Image the balls on the real machine; the scan is executed by the same machine.
+
+    centre: middle of the object in M, mm, where it is not what stands at the W origin at home (a robot's flange).
+    """
     disturbance = disturbance or Disturbance()
     real = real_motion(machine, poses, p, disturbance=disturbance, rng=rng)
     x = project_ball(
@@ -87,7 +90,7 @@ def experiment(
     return Experiment(
         machine=machine if believed is None else believed, poses=poses, observations=observations, scan=scan,
         P_true=eq5_matrices(scanner, T_HT=T_HT, T_MH=scanned.T_MH, alpha=scan.alpha),
-        points=home.R @ np.asarray(centre) + home.t + object_points() if np.any(centre) else object_points(),
+        points=object_points() if centre is None else home.apply(np.asarray(centre) + object_points()),
         scanner=scanner,
     )
 
@@ -116,22 +119,22 @@ def hexapod_experiment(
     )
 
 
-def robot_experiment(robot: Any, seed: int, *, n: int = 200) -> Experiment:
-    """The object on a robot's flange: n joint configurations around the working one, then a tilted scan by joint moves."""
+def robot_experiment(robot: Any, seed: int, *, n: int = 200, balls: int = 1) -> Experiment:
+    """The object on a robot's flange: n poses around the working one, then a tilted turn of 330 deg."""
     rng = np.random.default_rng(np.random.SeedSequence([6, seed]))
     p = rng.standard_normal(len(robot.names)) * robot.sigma
     centre = robot.forward(robot.q_start[None])
     # the working point lies at the W origin
     T_HT = RigidTransform.from_angles([0.01, -0.02, np.pi], np.zeros(3), source=Frame.H, target=Frame.T)
     T_HT = replace(T_HT, t=-(T_HT.R @ centre.t[0]))
-    t = np.array([[12.0, -14.0, 40.0]])
+    t = np.array([[20.0, -15.0, 60.0], [-22.0, 10.0, 20.0], [5.0, 24.0, 40.0]])[:balls]
     q = robot.inverse(
         RigidTransform(
-            R=centre.R[0] @ R_z(rng.uniform(-2.9, 2.9, n)) @ R_y(np.radians(rng.uniform(-15, 15, n))),
-            t=centre.t[0] + rng.uniform(-15, 15, (n, 3)), source=Frame.M, target=Frame.H,
+            R=centre.R[0] @ R_z(rng.uniform(-2.9, 2.9, n)) @ R_y(np.radians(rng.uniform(-20, 20, n))),
+            t=centre.t[0] + rng.uniform(-12, 12, (n, 3)), source=Frame.M, target=Frame.H,
         )
     )
-    poses = poses_from_joints(robot, q)
+    poses = poses_from_joints(robot, q, ball_id=np.arange(n) % balls)
     angle = np.linspace(-2.9, 2.9, 180)
     q_scan = robot.inverse(
         RigidTransform(
@@ -140,7 +143,7 @@ def robot_experiment(robot: Any, seed: int, *, n: int = 200) -> Experiment:
         )
     )
     scan = poses_from_joints(robot, q_scan)
-    return experiment(robot, p, poses, scan, T_HT=T_HT, balls=t, rng=rng, centre=(0, 0, 0))
+    return experiment(robot, p, poses, scan, T_HT=T_HT, balls=t, rng=rng, centre=(0.0, 0.0, 40.0))
 
 
 def trajectory_error(calibration: Calibration, e: Experiment) -> tuple[float, float, float]:

@@ -21,7 +21,7 @@ from tomopose.calibration.multi_ball import require_balls_not_swapped
 from tomopose.calibration.parameters import FreeParameters, adjusted_scanners, free_parameters, unit_of
 from tomopose.calibration.problem import Problem, pair
 from tomopose.calibration.result import Calibration, Observability, Parameter
-from tomopose.calibration.run_changes import require_same_pivot_throughout
+from tomopose.calibration.run_changes import change_in_words, find_change, require_same_pivot
 from tomopose.calibration.slack import determined_turns, map_candidates
 from tomopose.calibration.uncertainty import WIDENING_PROBABILITY, angles_by_tangent
 from tomopose.errors import InputError
@@ -63,8 +63,8 @@ def calibrate_kinematic(
     Parameters
     ----------
     scanner, poses, observations: as in `calibrate`.
-    rigid:        the calibration that trusts the poses: start of this one; the answer where "auto" finds no better.
-    manipulator:  Hexapod, SerialRobot, the content of hexapod.json or robot.json, or the path of one; None for "slack".
+    rigid:        the calibration that trusts the poses: the start, and the answer where "auto" finds no better.
+    manipulator:  Hexapod, SerialRobot, content or path of hexapod.json or robot.json; None for "slack".
     model:        "kinematic": the machine's errors; "slack": scatter and a smooth map of pose errors, for machines whose
                   kinematics nobody knows; "rigid": none; "auto": kinematic where evidence and held-out poses both say
                   that it is better, else rigid.
@@ -107,12 +107,12 @@ def calibrate_kinematic(
     if model == "slack":
         candidates += map_candidates(problem, start)
     fits = _fit_all(problem, start, candidates, robust)
-    _require_sound_run(fits, problem)
+    doubts = _sound_run(fits, problem)
     judged = {name: judge(name, fit) for name, fit in fits.items()}
     chosen = _choose(model, judged)
     if chosen == "rigid" and model == "auto":
         return replace(rigid, extra={**rigid.extra, **_comparison(judged, fits, chosen)})
-    return _calibration(rigid, fits, judged, chosen, model, data.pose_id)
+    return _calibration(rigid, fits, judged, chosen, model, data.pose_id, doubts)
 
 
 def machine_of(manipulator: Any) -> ErrorModel | None:
@@ -196,11 +196,13 @@ def _fit_all(
     return dict(reversed(fits.items()))
 
 
-def _require_sound_run(fits: Mapping[str, ModelFit], problem: KinematicProblem) -> None:
-    """Errors of the run itself, which no model of the machine may swallow, judged with the model that fits best."""
+def _sound_run(fits: Mapping[str, ModelFit], problem: KinematicProblem) -> tuple[str, ...]:
+    """Doubts about the run itself, judged with the model that fits best; InputError where it cannot be used."""
     fit = max(fits.values(), key=lambda f: f.estimate.log_evidence)
     require_balls_not_swapped(fit, problem)
-    require_same_pivot_throughout(fit)
+    change = find_change(fit)
+    require_same_pivot(fit, change)
+    return () if change is None else (change_in_words(fit, change),)
 
 
 def _choose(model: str, judged: Mapping[str, Judgement]) -> str:
@@ -252,7 +254,7 @@ def _parameters(fit: ModelFit) -> tuple[Parameter, ...]:
 
 def _calibration(
     rigid: Calibration, fits: Mapping[str, ModelFit], judged: Mapping[str, Judgement], chosen: str, asked: str,
-    ids: tuple[str, ...],
+    ids: tuple[str, ...], doubts: tuple[str, ...],
 ) -> Calibration:
     fit = fits[chosen]
     e = fit.estimate
@@ -273,7 +275,7 @@ def _calibration(
         "t_mm": problem.repeatability.t_mm * np.sqrt(problem.scatter),
         "w_rad": problem.repeatability.w_rad * np.sqrt(problem.scatter),
     }
-    reasons = list(_doubts(fit, judged, chosen))
+    reasons = [*doubts, *_doubts(fit, judged, chosen)]
     if asked == "slack":
         sentence = determined_turns(e)
         if sentence:

@@ -18,7 +18,11 @@ from tomopose.units import Array
 SCATTER_STEPS = 12
 SCATTER_TOLERANCE = 0.02
 LARGEST_SCATTER = 1e10
+SOFTENINGS = (1.0, 1e2, 1e4, 1e6)
 REWEIGHTINGS = 15
+GROSS = 8.0
+"""Times the median residual of the start: rows beyond it are no positioning errors of the same machine, and stay out of
+the first fit; what belongs comes back."""
 SIZE_STEPS = 4
 SMALLEST_SIZE, LARGEST_SIZE = 1e-3, 30.0
 SIZE_GAIN = 3.0
@@ -55,27 +59,46 @@ def distances(estimate: MapEstimate, whole: KinematicProblem, keep: Any) -> Arra
     return d2
 
 
+def solve_softened(problem: KinematicProblem, start: State) -> MapEstimate:
+    """The optimum; where none is reached because the model misfits grossly, that with the scatter raised.
+
+    Residuals of hundreds of standard deviations drag the errors along the curved valleys in which they replace one
+    another; a scatter of the residuals' size lets the priors hold them.
+    """
+    for soften in SOFTENINGS[:-1]:
+        try:
+            return solve_map(replace(problem, scatter=problem.scatter * soften), start)
+        except NotConvergedError:
+            continue
+    return solve_map(replace(problem, scatter=problem.scatter * SOFTENINGS[-1]), start)
+
+
 def with_scatter(estimate: MapEstimate) -> MapEstimate:
-    """The estimate with the plate's scatter raised until chi2 is what right covariances leave; never lowered.
+    """The estimate with the plate's scatter raised until chi2 is what right covariances leave; never below the stated.
 
     Scatter is raised only where chi2 lies above the value exceeded once in a hundred runs.
     """
-    if estimate.dof <= 0 or estimate.chi2 <= chdtri(estimate.dof, WIDENING_PROBABILITY):
-        return estimate
-    if not estimate.problem.repeatability.variance.any():
-        return estimate
-    f, best = 1.0, estimate
+    f, best = estimate.problem.scatter, estimate
+    if best.dof <= 0 or not best.problem.repeatability.variance.any():
+        return best
+    if f <= 1.0 and best.chi2 <= chdtri(best.dof, WIDENING_PROBABILITY):
+        return best
     low, high = 1.0, np.inf
     for _ in range(SCATTER_STEPS):
         ratio = best.chi2 / best.dof
-        if abs(ratio - 1) < SCATTER_TOLERANCE:
+        if abs(ratio - 1) < SCATTER_TOLERANCE or (ratio < 1 and f <= 1.0):
             break
         low, high = (max(low, f), high) if ratio > 1 else (low, min(high, f))
-        guess = f * ratio**1.5 if ratio > 1 else f * ratio
+        guess = f * ratio**1.5 if ratio > 1 else max(f * ratio**1.5, 1.0)
         f = guess if low < guess < high else (np.sqrt(low * high) if np.isfinite(high) else f * 4)
-        if f > LARGEST_SCATTER:
+        if f > LARGEST_SCATTER or high / low < 1.0 + SCATTER_TOLERANCE:
             break
-        best = solve_map(replace(best.problem, scatter=f), best.state)
+        try:
+            best = solve_map(replace(best.problem, scatter=f), best.state)
+        except NotConvergedError:
+            low, f = f, best.problem.scatter
+            if high / low < 1.0 + SCATTER_TOLERANCE:
+                break
     return best
 
 
@@ -111,11 +134,10 @@ def fit_model(
     n = len(problem.poses)
     given = keep is not None
     keep = np.asarray(keep) if given else np.ones(n, dtype=bool)
-    estimate = solve_map(problem if keep.all() else problem.rows(keep), start)
     if robust and not given:
-        d2 = distances(estimate, problem, keep)
-        if d2.max() > limit(n) * max(1.0, _scale(d2)):
-            estimate, keep = _without_outliers(problem, estimate)
+        estimate, keep = _robust(problem, start)
+    else:
+        estimate = solve_softened(problem if keep.all() else problem.rows(keep), start)
     estimate = with_scatter(estimate)
     estimate, size = with_size(estimate) if resize else (estimate, 1.0)
     whole = replace(problem, scatter=estimate.problem.scatter, model=estimate.problem.model)
@@ -126,36 +148,47 @@ def _scale(d2: Array) -> float:
     return float(np.median(d2) / MEDIAN_CHI2_2)
 
 
-def _without_outliers(problem: KinematicProblem, first: MapEstimate) -> tuple[MapEstimate, Any]:
-    """The fit of the rows that belong; the first fit and all rows where no few outliers explain the misfit."""
+def _robust(problem: KinematicProblem, start: State) -> tuple[MapEstimate, Any]:
+    """The fit of the rows that belong, and which; of all rows where no few outliers explain the misfit."""
     n = len(problem.poses)
     everything = np.ones(n, dtype=bool)
-    state, weight = first.state, np.ones(n)
-    try:
-        for _ in range(REWEIGHTINGS):
-            estimate = solve_map(replace(problem, weight=weight), state)
-            state = estimate.state
-            W = whiteners(estimate.at.C * weight[:, None, None])
-            d2 = ((W @ estimate.at.r[:, :, None])[..., 0] ** 2).sum(axis=1)
-            # Geman-McClure, whose influence falls to zero; the floor keeps every covariance finite
-            new = np.maximum((1.0 + d2 / (9.0 * max(1.0, _scale(d2)))) ** -2, 1e-12)
-            settled = np.abs(new - weight).max() < 1e-2
-            weight = new
-            if settled:
-                break
-        keep = d2 <= limit(n) * max(1.0, _scale(d2))
-        for _ in range(RECLASSIFICATIONS):
-            if keep.mean() < 1.0 - LARGEST_SHARE or not _every_ball(problem, keep):
-                break
-            estimate = solve_map(problem.rows(keep), state)
-            d2 = distances(estimate, problem, keep)
-            new_keep = d2 <= limit(n) * max(1.0, _scale(d2[keep]))
-            if (new_keep == keep).all():
-                return estimate, keep
-            keep, state = new_keep, estimate.state
-    except NotConvergedError:
-        pass
-    return first, everything
+    d = np.linalg.norm(linearise(problem, start).r, axis=1)
+    keep = d <= GROSS * np.median(d)
+    if keep.mean() < 1.0 - LARGEST_SHARE or not _every_ball(problem, keep):
+        keep = everything
+    estimate = solve_softened(problem if keep.all() else problem.rows(keep), start)
+    softened = replace(problem, scatter=estimate.problem.scatter)
+    d2 = distances(estimate, softened, keep)
+    if d2.max() <= limit(n) * max(1.0, _scale(d2)):
+        return (estimate if keep.all() else solve_map(softened, estimate.state)), everything
+    state = estimate.state
+    weight = _weights(d2)
+    for _ in range(REWEIGHTINGS):
+        estimate = solve_map(replace(softened, weight=weight), state)
+        state = estimate.state
+        W = whiteners(estimate.at.C * weight[:, None, None])
+        d2 = ((W @ estimate.at.r[:, :, None])[..., 0] ** 2).sum(axis=1)
+        new = _weights(d2)
+        settled = np.abs(new - weight).max() < 1e-2
+        weight = new
+        if settled:
+            break
+    keep = d2 <= limit(n) * max(1.0, _scale(d2))
+    for _ in range(RECLASSIFICATIONS):
+        if keep.mean() < 1.0 - LARGEST_SHARE or not _every_ball(softened, keep):
+            break
+        estimate = solve_map(problem.rows(keep), state)
+        d2 = distances(estimate, softened, keep)
+        new_keep = d2 <= limit(n) * max(1.0, _scale(d2[keep]))
+        if (new_keep == keep).all():
+            return estimate, keep
+        keep, state = new_keep, estimate.state
+    return solve_softened(problem, start), everything
+
+
+def _weights(d2: Array) -> Array:
+    """Geman-McClure's, whose influence falls to zero; the floor keeps every covariance finite."""
+    return np.maximum((1.0 + d2 / (9.0 * max(1.0, _scale(d2)))) ** -2, 1e-12)
 
 
 def _every_ball(problem: KinematicProblem, keep: Any) -> bool:

@@ -32,9 +32,10 @@ from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import ErrorModel, Repeatability
 from tomopose.units import Array
 
-STEPS = 40
-COST_TOLERANCE = 1e-8
-"""Relative to the number of equations: a step that gains less than this in chi2 ends the iteration."""
+STEPS = 50
+COST_TOLERANCE, VALLEY_TOLERANCE = 1e-6, 1e-4
+"""Relative to the number of equations: a step that gains less than the first in chi2 ends the iteration; the second, a
+fifth of a standard deviation at most, is accepted after all steps in a flat valley."""
 LEAST_DAMPING, LARGEST_DAMPING = 1e-6, 1e8
 
 
@@ -237,6 +238,8 @@ def solve_map(problem: KinematicProblem, start: State) -> MapEstimate:
         if abs(drop) < COST_TOLERANCE * len(r) and damping < 1.0:
             return _estimate(problem, state, r, J, at, step)
         damping = damping / 10 if damping > LEAST_DAMPING else 0.0
+    if abs(drop) < VALLEY_TOLERANCE * len(r):
+        return _estimate(problem, state, r, J, at, STEPS)
     raise NotConvergedError(f"no optimum after {STEPS} steps; the last one still gained {drop:.3g} in chi2")
 
 

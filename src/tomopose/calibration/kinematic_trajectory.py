@@ -12,7 +12,6 @@ import numpy as np
 
 from tomopose.calibration.residuals import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.result import Calibration
-from tomopose.geometry.projection import project
 from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.manipulator.error_models import correction
 from tomopose.manipulator.poses import PoseSequence
@@ -34,24 +33,32 @@ def point_jacobian(P: Array, x: Array) -> Array:
     return (P[:, None, :2, :3] - (h[..., :2] / w)[..., None] * P[:, None, 2:, :3]) / w[..., None]
 
 
+def pixels(P: Array, x: Array) -> Array:
+    """Pixels (n, m, 2) of points x (m, 3), whatever the sign of P: the W origin of a robot's home may lie behind the
+    source, and `canonical` then turns the sign of w for the object."""
+    h = np.einsum("nij,mj->nmi", P[:, :, :3], x) + P[:, None, :, 3]
+    return h[..., :2] / h[..., 2:]
+
+
 def without_object_pose(P: Any, P_true: Any, points: Any) -> Array:
     """Differences (n, m, 2), px, of the points' pixels under P and P_true, the best rigid object pose removed.
 
     The pose is the one that minimises their sum of squares, found by Gauss-Newton.
     """
     P, P_true, x = np.asarray(P), np.asarray(P_true), np.asarray(points, dtype=np.float64)
-    target = project(P_true, x)
-    R, t = np.eye(3), np.zeros(3)
+    target = pixels(P_true, x)
+    R, t = np.eye(3), x.mean(axis=0)
+    x = x - t
     for _ in range(POSE_STEPS):
         y = x @ R.T + t
-        d = project(P, y) - target
+        d = pixels(P, y) - target
         G = point_jacobian(P, y)
         J = np.concatenate([-G @ skew(y - t), G], axis=3).reshape(-1, 6)
         step = np.linalg.lstsq(J, -d.ravel(), rcond=None)[0]
         R, t = exp_rotation(step[:3]) @ R, t + step[3:]
         if np.abs(step).max() < 1e-12:
             break
-    return project(P, x @ R.T + t) - target
+    return pixels(P, x @ R.T + t) - target
 
 
 def rms_px(d: Array) -> float:

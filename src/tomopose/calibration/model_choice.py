@@ -118,7 +118,7 @@ def by_rotation(poses: PoseSequence, residuals: Mapping[str, Array], scanner: Sc
     label = np.char.add(label, np.array(["x", "y", "z"])[axis])
     label = np.where(np.abs(main) < AXIS_SHARE * angle, "mixed", label)
     label = np.where(angle < SMALLEST_TURN, "none", label)
-    um = np.sqrt(scanner.p_u * scanner.p_v) / scanner.magnification * 1000.0
+    um = float(np.sqrt(scanner.p_u * scanner.p_v)) / scanner.magnification * 1000.0
     rows = []
     for name in ("none", "+x", "-x", "+y", "-y", "+z", "-z", "mixed"):
         mine = label == name

@@ -23,8 +23,9 @@ LARGEST_JOINT_SIGMA_MM = 20.0
 CONFIRM = 'convert them, or add "units": "confirmed" if the numbers are right'
 
 HEXAPOD_KEYS = (
-    "schema", "base_joints_mm", "platform_joints_mm", "joint_sigma_mm", "leg_sigma_mm", "leg_scale_sigma",
-    "axes_sigma_rad", "pivot_sigma_mm", "leg_limits_mm", "repeatability", "units", "name", "comment", "provenance",
+    "schema", "base_joints_mm", "platform_joints_mm", "joint_sigma_mm", "leg_sigma_mm", "scale_sigma", "geometry_sigma",
+    "leg_scale_sigma", "axes_sigma_rad", "pivot_sigma_mm", "leg_limits_mm", "repeatability", "units", "name", "comment",
+    "provenance",
 )
 SERIAL_KEYS = (
     "schema", "convention", "joints", "tool", "q_start_deg", "repeatability", "units", "name", "comment", "provenance",
@@ -84,7 +85,8 @@ def hexapod_from_document(document: Mapping[str, Any], where: str) -> Hexapod:
     sigma = {
         key: _number(document, key, default, where)
         for key, default in (
-            ("joint_sigma_mm", 0.1), ("leg_sigma_mm", 0.1), ("leg_scale_sigma", 0.0), ("axes_sigma_rad", 0.0),
+            ("joint_sigma_mm", 0.1), ("leg_sigma_mm", 0.1), ("scale_sigma", 0.05), ("geometry_sigma", 0.05),
+            ("leg_scale_sigma", 0.0), ("axes_sigma_rad", 0.0),
             ("pivot_sigma_mm", 0.0),
         )
     }
@@ -101,6 +103,8 @@ def hexapod_from_document(document: Mapping[str, Any], where: str) -> Hexapod:
         platform_joints=joints["platform_joints_mm"],
         joint_sigma=sigma["joint_sigma_mm"],
         leg_sigma=sigma["leg_sigma_mm"],
+        scale_sigma=sigma["scale_sigma"],
+        geometry_sigma=sigma["geometry_sigma"],
         leg_scale_sigma=sigma["leg_scale_sigma"],
         axes_sigma=sigma["axes_sigma_rad"],
         pivot_sigma=sigma["pivot_sigma_mm"],

@@ -36,6 +36,14 @@ from tomopose.units import Array, float_array
 NEWTON_STEPS = 30
 NEWTON_TOLERANCE = 1e-11
 """mm in the legs; rounding of lengths of 250 mm is 1e-13."""
+GEOMETRY = tuple(
+    f"geometry_{g}" for g in ("scale", "base_radius", "base_height", "platform_radius", "platform_height")
+)
+"""How a file's geometry may be wrong as a whole: all of it, or radius and height over the pivot of either plate."""
+GROUPS = (
+    "base_joint", "platform_joint", "leg_offset", "geometry_scale", "geometry_base_radius", "leg_scale", "axes", "pivot"
+)
+GEOMETRY_COLUMNS = {"geometry_scale": slice(0, 1), "geometry_base_radius": slice(1, 5)}
 SINGULAR_CONDITION = 1e5
 """Condition of A (lengths in units of the platform's radius) above which a pose counts as singular."""
 
@@ -46,6 +54,8 @@ class Hexapod:
 
     base_joints (6, 3): in H, mm; platform_joints (6, 3): in M, mm; the pivot is the origin of H.
     joint_sigma, leg_sigma:  standard deviation, mm, of each joint coordinate and of each leg's offset.
+    scale_sigma, geometry_sigma:  relative, of the file's geometry as a whole and of radius and height over the pivot of
+                      either plate, which the controller knows and the file may not; they act only with other errors.
     leg_scale_sigma:  of each leg's relative scale error (pitch of its spindle); 0: not modelled.
     axes_sigma:       rad, of the rotation between turning and shifting axes; 0: not modelled.
     pivot_sigma:      mm, of the pivot; 0: not modelled.  Without axes errors a constant pivot error does nothing.
@@ -56,6 +66,8 @@ class Hexapod:
     platform_joints: Array
     joint_sigma: float = 0.1
     leg_sigma: float = 0.1
+    scale_sigma: float = 0.05
+    geometry_sigma: float = 0.05
     leg_scale_sigma: float = 0.0
     axes_sigma: float = 0.0
     pivot_sigma: float = 0.0
@@ -70,7 +82,9 @@ class Hexapod:
             if not np.isfinite(joints).all():
                 raise InputError(f"{name} holds values that are not finite")
             object.__setattr__(self, name, joints)
-        for name in ("joint_sigma", "leg_sigma", "leg_scale_sigma", "axes_sigma", "pivot_sigma"):
+        for name in (
+            "joint_sigma", "leg_sigma", "scale_sigma", "geometry_sigma", "leg_scale_sigma", "axes_sigma", "pivot_sigma",
+        ):
             value = float(getattr(self, name))
             if not (np.isfinite(value) and value >= 0):
                 raise InputError(f"hexapod: {name} is {value}; a standard deviation >= 0 is needed")
@@ -88,6 +102,8 @@ class Hexapod:
             (tuple(f"base_joint_{j}" for j in joints), "mm", self.joint_sigma),
             (tuple(f"platform_joint_{j}" for j in joints), "mm", self.joint_sigma),
             (tuple(f"leg_offset_{k}" for k in legs), "mm", self.leg_sigma),
+            (GEOMETRY[:1], "1", self.scale_sigma),
+            (GEOMETRY[1:], "1", self.geometry_sigma),
             (tuple(f"leg_scale_{k}" for k in legs), "1", self.leg_scale_sigma),
             (tuple(f"axes_{x}" for x in "xyz"), "rad", self.axes_sigma),
             (tuple(f"pivot_{x}" for x in "xyz"), "mm", self.pivot_sigma),
@@ -114,7 +130,7 @@ class Hexapod:
         out, start = {}, 0
         for names, _, _ in self._groups:
             place = slice(start, start + len(names))
-            out[names[0].rsplit("_", 1)[0].removesuffix("_1")] = (place, p[place])
+            out[next(group for group in GROUPS if names[0].startswith(group))] = (place, p[place])
             start = place.stop
         return out
 
@@ -147,28 +163,38 @@ class Hexapod:
                 J_command[:, :, place_c] = J_c
             if "pivot" in part:
                 J_command[:, :, place_q] = J_q
-        legs, A_nominal = _legs(self.base_joints, self.platform_joints, R, t)
+        g = np.zeros(len(GEOMETRY))
+        for group, columns in GEOMETRY_COLUMNS.items():
+            if group in part:
+                g[columns] = part[group][1]
+        b, m = self.base_joints * (1 + g[0] + g[[1, 1, 2]]), self.platform_joints * (1 + g[0] + g[[3, 3, 4]])
+        legs, A_nominal = _legs(b, m, R, t)
+        J_legs = A_nominal @ J_command
+        for group, columns in GEOMETRY_COLUMNS.items():
+            if group in part:
+                J_legs[:, :, part[group][0]] += _legs_by_geometry(
+                    self.base_joints, self.platform_joints, A_nominal[:, :, 3:], R
+                )[..., columns]
         self._require_limits(legs)
         db = part.get("base_joint", (None, none))[1]
         dp = part.get("platform_joint", (None, none))[1]
-        b = self.base_joints + (db.reshape(6, 3) if db.size else 0.0)
-        m = self.platform_joints + (dp.reshape(6, 3) if dp.size else 0.0)
+        b = b + (db.reshape(6, 3) if db.size else 0.0)
+        m = m + (dp.reshape(6, 3) if dp.size else 0.0)
         real_legs = legs.copy()
         if "leg_scale" in part:
             real_legs *= 1 + part["leg_scale"][1]
         if "leg_offset" in part:
             real_legs = real_legs + part["leg_offset"][1]
         R, t, A = _forward(b, m, real_legs, R, t)
-        return RealPoses(R=R, t=t, J=self._jacobian(part, R, A, legs, A_nominal, J_command))
+        return RealPoses(R=R, t=t, J=self._jacobian(part, R, A, legs, J_legs))
 
     def _jacobian(
-        self, part: Mapping[str, tuple[slice, Array]], R: Array, A: Array, legs: Array, A_nominal: Array,
-        J_command: Array,
+        self, part: Mapping[str, tuple[slice, Array]], R: Array, A: Array, legs: Array, J_legs: Array
     ) -> Array:
-        """d(w, t) / dp (n, 6, m) = A^-1 dlegs / dp."""
+        """d(w, t) / dp (n, 6, m) = A^-1 dlegs / dp, given how the nominal legs (n, 6) answer, J_legs (n, 6, m)."""
         normal = A[:, :, 3:]
         scale = 1 + part["leg_scale"][1] if "leg_scale" in part else np.ones(6)
-        rhs = scale[:, None] * (A_nominal @ J_command)
+        rhs = scale[:, None] * J_legs
         k = np.arange(6)
         if "base_joint" in part:
             view = rhs[:, :, part["base_joint"][0]].reshape(len(R), 6, 6, 3)
@@ -178,6 +204,11 @@ class Hexapod:
             view = rhs[:, :, part["platform_joint"][0]].reshape(len(R), 6, 6, 3)
             view[:, k, k] -= normal @ R
             rhs[:, :, part["platform_joint"][0]] = view.reshape(len(R), 6, 18)
+        for group, columns in GEOMETRY_COLUMNS.items():
+            if group in part:
+                rhs[:, :, part[group][0]] -= _legs_by_geometry(
+                    self.base_joints, self.platform_joints, normal, R
+                )[..., columns]
         if "leg_offset" in part:
             rhs[:, :, part["leg_offset"][0]] += np.eye(6)
         if "leg_scale" in part:
@@ -199,7 +230,7 @@ class Hexapod:
 
     def resized(self, size: float) -> Hexapod:
         """The same hexapod with all standard deviations of its errors multiplied by `size`."""
-        names = ("joint_sigma", "leg_sigma", "leg_scale_sigma", "axes_sigma", "pivot_sigma")
+        names = ("joint_sigma", "leg_sigma", "leg_scale_sigma", "axes_sigma", "pivot_sigma")  # the file stays the file
         return replace(self, **{name: size * getattr(self, name) for name in names})
 
     def to_json(self) -> dict[str, Any]:
@@ -209,6 +240,8 @@ class Hexapod:
             "platform_joints_mm": self.platform_joints.tolist(),
             "joint_sigma_mm": self.joint_sigma,
             "leg_sigma_mm": self.leg_sigma,
+            "scale_sigma": self.scale_sigma,
+            "geometry_sigma": self.geometry_sigma,
             "leg_scale_sigma": self.leg_scale_sigma,
             "axes_sigma_rad": self.axes_sigma,
             "pivot_sigma_mm": self.pivot_sigma,
@@ -254,13 +287,20 @@ def _forward(b: Array, p: Array, legs: Array, R: Array, t: Array) -> tuple[Array
     )
 
 
+def _legs_by_geometry(b: Array, p: Array, normal: Array, R: Array) -> Array:
+    """d legs / d GEOMETRY (n, 6, 5), with unit vectors normal (n, 6, 3) of the legs."""
+    on_base, on_plate = -normal * b, (normal @ R) * p
+    parts = [on_base[..., 0] + on_base[..., 1], on_base[..., 2], on_plate[..., 0] + on_plate[..., 1], on_plate[..., 2]]
+    return np.stack([sum(parts), *parts], axis=-1)
+
+
 def _condition(A: Array) -> Array:
     """(n,): |A| |A^-1| in Frobenius' norm, inf where A has no inverse."""
     try:
         inverse = np.linalg.inv(A)
     except np.linalg.LinAlgError:
         singular_values = np.linalg.svd(A, compute_uv=False)
-        return np.where(singular_values[:, -1] > 0, singular_values[:, 0] / np.maximum(singular_values[:, -1], 1e-300), np.inf)
+        return np.asarray(singular_values[:, 0] / np.maximum(singular_values[:, -1], 1e-300))
     return np.asarray(np.linalg.norm(A, axis=(1, 2)) * np.linalg.norm(inverse, axis=(1, 2)))
 
 
