@@ -1,0 +1,226 @@
+"""Calibration poses by optimal design: as few images as the wanted accuracy needs, within the machine's limits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tomopose.calibration.fit import tangent_names
+from tomopose.calibration.parameters import FreeParameters, free_parameters
+from tomopose.calibration.residuals import projection_blocks
+from tomopose.calibration.uncertainty import inverse_information
+from tomopose.errors import InputError, NotObservableError
+from tomopose.geometry.frames import Frame
+from tomopose.geometry.scanner import Scanner
+from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.poses import PoseSequence
+from tomopose.planning.exchange import Chosen, Criterion, exchange
+from tomopose.planning.limits import PlanLimits, candidates
+from tomopose.planning.order import ordered, rows_of, run_time
+from tomopose.planning.resolve import Resolvability, resolvability
+from tomopose.planning.target import ScanTarget, scan_target
+from tomopose.trajectory.pose_grid import pose_grid
+from tomopose.trajectory.tilt import R_HT_MOUNTED
+from tomopose.units import Array
+
+SIGMA_PX = 0.0207 / np.sqrt(2.0)
+"""Standard uncertainty of a coordinate of a centre: the paper's d_rms of 0.0207 px counts both (eq. 8)."""
+
+BALL_MM = (10.0, -8.0, 16.0)
+"""A ball 20 mm off the pivot in no special direction: on the pivot, rotations could not be told from one another."""
+
+MOST_IMAGES = 400
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosePlan:
+    """Poses to image, in order, the first repeated at the end.
+
+    predicted:   scan reprojection error, px rms, that the calibration from these poses will cause.
+    reference:   the same of the paper's 189 poses under the same noise, table still.
+    u:           predicted standard uncertainties by coordinate of the calibration's tangent (mm, rad, px).
+    covariance:  (m, m) of all.
+    resolved:    which rival conventions these poses would show, or None where it was not asked for.
+    duration:    s.
+    """
+
+    poses: PoseSequence
+    predicted: float
+    reference: float
+    u: Mapping[str, float]
+    covariance: Array
+    resolved: Resolvability | None
+    duration: float
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+
+def nominal_mount() -> RigidTransform:
+    """R_z(pi), no translation: the paper's mount before it is calibrated."""
+    return RigidTransform(R=R_HT_MOUNTED, t=np.zeros(3), source=Frame.H, target=Frame.T)
+
+
+def pose_information(
+    scanner: Scanner, poses: PoseSequence, *, T_HT: RigidTransform, t: Array, sigma: float,
+    free: FreeParameters | None = None,
+) -> Array:
+    """(n, 2, m): whitened Jacobian of every pose by w_HT, t_HT, t and the freed parameters."""
+    b = projection_blocks(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=t, alpha=poses.alpha)
+    parts = [b.J_mount, b.J_t]
+    if free is not None and len(free):
+        parts.append(b.J_scanner[:, :, free.cols] * free.factor)
+    return np.concatenate(parts, axis=2) / sigma
+
+
+def _prior_information(free: FreeParameters) -> Array:
+    N = np.zeros((9 + len(free), 9 + len(free)))
+    N[9:, 9:] = np.diag(free.information)
+    return N
+
+
+def predicted_covariance(
+    scanner: Scanner, poses: PoseSequence, *, T_HT: RigidTransform, t: Any, sigma: float = SIGMA_PX,
+    free: FreeParameters | None = None,
+) -> Array:
+    """(m, m): covariance of a calibration from these poses, before a single image is taken."""
+    L = pose_information(scanner, poses, T_HT=T_HT, t=np.asarray(t, dtype=np.float64), sigma=sigma, free=free)
+    N = np.einsum("kia,kib->ab", L, L)
+    return inverse_information(N if free is None else N + _prior_information(free))
+
+
+def _largest_affordable(limits: PlanLimits) -> int:
+    """Images that fit in the time if every move takes its least time."""
+    if limits.total_time is None:
+        return MOST_IMAGES
+    return min(MOST_IMAGES, int(limits.total_time // (limits.image_time + limits.settle)))
+
+
+def plan_poses(
+    scanner: Scanner,
+    *,
+    T_HT: RigidTransform | None = None,
+    t: Any = BALL_MM,
+    n: int | None = None,
+    goal: float | None = None,
+    sigma: float = SIGMA_PX,
+    limits: PlanLimits | None = None,
+    scan: PoseSequence | None = None,
+    points: Any = None,
+    free: Iterable[str] = (),
+    priors: Mapping[str, float] | None = None,
+    criterion: Criterion = "A",
+    resolve: bool = True,
+    seed: int = 0,
+) -> PosePlan:
+    """The best calibration poses for a scan.
+
+    Parameters
+    ----------
+    T_HT, t:   nominal mount (default R_z(pi)) and ball centre in M, mm: roughly is enough.  A ball on the pivot hides
+               mistakes; the default is 20 mm off.
+    n, goal:   number of images (the repeated first one included), or the scan reprojection error, px rms, to reach with
+               as few as possible (default: what the paper's 189 poses reach).
+    sigma:     expected standard uncertainty of a centre's coordinate, px.
+    limits:    travel, table angles, field of view, magnification, boxes, time.
+    scan, points: what the calibration is for: the scan's poses and the object's points (p, 3) in W, mm
+               (default: the paper's tilted scan, eq. (11), and a box of +-15, +-15, +-30 mm).
+    free, priors: scanner parameters to be estimated too, as in `calibrate`.
+    criterion: "A": the scan reprojection error itself;  "D": the volume of the confidence region.
+    resolve:   also find which rival conventions the poses would show.
+
+    Raises
+    ------
+    InputError, OutOfReachError, NotObservableError (a goal or parameter that no allowed poses reach).
+    """
+    T_HT = nominal_mount() if T_HT is None else T_HT.require(Frame.H, Frame.T)
+    ball = np.asarray(t, dtype=np.float64).reshape(3)
+    limits = PlanLimits() if limits is None else limits
+    if not sigma > 0:
+        raise InputError(f"sigma is {sigma}; a positive number of pixels is needed")
+    freed = free_parameters((scanner,), free=free, priors=priors)
+    target = scan_target(scanner, T_HT=T_HT, scan=scan, points=points, free=freed)
+    pool = candidates(scanner, T_HT=T_HT, t=ball, limits=limits)
+    L = pose_information(scanner, pool, T_HT=T_HT, t=ball, sigma=sigma, free=freed)
+    prior = _prior_information(freed)
+    _require_determined(L, prior, target)
+    reference = scan_target(scanner, T_HT=T_HT, scan=scan, points=points).rms(
+        predicted_covariance(scanner, pose_grid(3), T_HT=T_HT, t=ball, sigma=sigma)
+    )
+
+    def choose(k: int) -> Chosen:
+        """k images, one pose among them twice: the first, which the run ends with."""
+        best = exchange(L, k, M=target.M, N_0=prior, criterion=criterion, seed=seed)
+        if len(np.unique(best.index)) < k:
+            return best
+        fewer = exchange(L, k - 1, M=target.M, N_0=prior, criterion=criterion, seed=seed)
+        index = np.append(fewer.index, fewer.index[0])
+        N = np.einsum("kia,kib->ab", L[index], L[index]) + prior
+        return Chosen(index=index, covariance=inverse_information(N), value=np.nan)
+
+    most = _largest_affordable(limits)
+    if n is not None:
+        chosen = choose(_checked(n, most))
+    else:
+        chosen = _fewest(choose, target, reference if goal is None else goal, most, len(prior))
+    poses = ordered(rows_of(pool, chosen.index), limits)
+    while limits.total_time is not None and run_time(poses, limits) > limits.total_time and len(poses) > len(prior):
+        chosen = choose(len(poses) - max(1, len(poses) // 20))
+        poses = ordered(rows_of(pool, chosen.index), limits)
+    covariance = predicted_covariance(scanner, poses, T_HT=T_HT, t=ball, sigma=sigma, free=freed)
+    names = tangent_names((0,), freed)
+    return PosePlan(
+        poses=poses,
+        predicted=target.rms(covariance),
+        reference=reference,
+        u=dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+        covariance=covariance,
+        resolved=resolvability(scanner, poses, T_HT=T_HT, t=ball, sigma=sigma) if resolve else None,
+        duration=run_time(poses, limits),
+    )
+
+
+def _checked(n: int, most: int) -> int:
+    if int(n) != n or n < 6:
+        raise InputError(f"{n!r} images are asked for; a whole number from 6 is needed")
+    if n > most:
+        raise InputError(f"{n} images are asked for, but time allows at most {most}")
+    return int(n)
+
+
+def _require_determined(L: Array, prior: Array, target: ScanTarget) -> None:
+    """All candidates together must determine every coordinate."""
+    N = np.einsum("kia,kib->ab", L, L) + prior
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
+    value, V = np.linalg.eigh(N * scale[:, None] * scale)
+    if value[0] < 1e-12:
+        worst = target.names[int(np.abs(V[:, 0]).argmax())]
+        raise NotObservableError(
+            f"no poses within these limits determine {worst}; allow more table angles or travel, or give it a prior",
+            direction=worst, singular_values=np.sqrt(np.maximum(value[::-1], 0.0)).tolist(),
+        )
+
+
+def _fewest(choose: Any, target: ScanTarget, wanted: float, most: int, m: int) -> Chosen:
+    """The smallest design that reaches the goal: doubling, then bisection."""
+    low, high = max(6, m // 2 + 2), max(12, m)
+    design = choose(min(high, most))
+    while target.rms(design.covariance) > wanted:
+        if high >= most:
+            raise NotObservableError(
+                f"{most} images reach {target.rms(design.covariance):.3g} px, not the {wanted:.3g} px asked for; widen "
+                "the limits, allow table angles, or lower the goal",
+            )
+        low, high = high, min(2 * high, most)
+        design = choose(high)
+    while high - low > 1:
+        middle = (low + high) // 2
+        trial = choose(middle)
+        if target.rms(trial.covariance) <= wanted:
+            high, design = middle, trial
+        else:
+            low = middle
+    return design
