@@ -30,12 +30,14 @@ _HOME = {
     "pair_images": "tomopose.io",
     "projection_matrices": "tomopose.calibration.apply",
     "read_calibration": "tomopose.io",
+    "read_gcs_log": "tomopose.io",
     "read_geometry": "tomopose.exports",
     "read_manipulator": "tomopose.manipulator.files",
     "read_matrices": "tomopose.io",
     "read_observations": "tomopose.io",
     "read_poses": "tomopose.io",
     "read_scanner": "tomopose.io",
+    "read_volume": "tomopose.io.volume_files",
     "reconstruct": "tomopose.reconstruction",
     "simulate_ball_run": "tomopose.simulation.run",
     "write_calibration": "tomopose.io",
@@ -44,6 +46,7 @@ _HOME = {
     "write_poses": "tomopose.io",
     "write_scanner": "tomopose.io",
     "write_tiff": "tomopose.io",
+    "write_volume": "tomopose.io.volume_files",
 }
 
 __all__ = list(_HOME)  # kept sorted; a test holds it

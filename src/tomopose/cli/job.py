@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,8 +13,6 @@ from tomopose.cli.common import NOT_TRUSTWORTHY, OK, Say
 if TYPE_CHECKING:
     from tomopose import BallObservations, Calibration, PoseSequence, ProjectionMatrices, Scanner
     from tomopose.report.thumbnails import Thumbnail
-
-WORST_SHOWN = 12
 
 
 def image_source(text: str) -> str | Path:
@@ -87,21 +85,12 @@ def observe(
     return replace(found, image=tuple(Path(name).name for name in images.names))
 
 
-def thumbnails(observations: BallObservations, images: Any, residual: Mapping[str, float]) -> list[Thumbnail]:
-    """Pictures of the images that deserve a look: not measured ones first, then the largest residuals."""
-    from tomopose.report import thumbnail
+def worst(calibration: Calibration, observations: BallObservations, images: Any) -> tuple[Thumbnail, ...]:
+    """Pictures of the images that deserve a look: those not measured first, then the largest residuals."""
+    from tomopose.report import worst_thumbnails
 
-    order = sorted(
-        range(len(observations)),
-        key=lambda k: (bool(observations.seen[k]), -residual.get(observations.pose_id[k], float("inf"))),
-    )
-    shown = []
-    for k in order[:WORST_SHOWN]:
-        d = residual.get(observations.pose_id[k])
-        shown.append(
-            thumbnail(observations, k, images[k], text="not used" if d is None else f"residual {d:.4f} px")
-        )
-    return shown
+    residuals = dict(zip(calibration.pose_id, calibration.d.tolist(), strict=True))
+    return worst_thumbnails(observations, images, residuals=residuals)
 
 
 def write_calibration_folder(
@@ -119,8 +108,7 @@ def write_calibration_folder(
     from tomopose.files import atomic_folder
     from tomopose.report import calibration_report, write_report
 
-    residual = dict(zip(calibration.pose_id, calibration.d.tolist(), strict=True))
-    pictures: Sequence[Thumbnail] = () if images is None else thumbnails(observations, images, residual)
+    pictures = () if images is None else worst(calibration, observations, images)
     with atomic_folder(out, force=force) as folder:
         tp.write_calibration(folder / "calibration.json", calibration)
         tp.write_observations(folder / "observations.csv", observations)

@@ -28,6 +28,7 @@ VERBS = (
     "matrices",
     "export",
     "import_geometry",
+    "reconstruct",
     "report",
     "doctor",
 )

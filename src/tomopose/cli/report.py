@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -28,7 +28,7 @@ def report(
 ) -> int:
     """Write one HTML file that needs no network: verdict, parameters, residuals, pictures, the scene in 3D."""
     import tomopose as tp
-    from tomopose.cli.job import image_source, open_for, thumbnails
+    from tomopose.cli.job import image_source, open_for, worst
     from tomopose.errors import FileError
     from tomopose.files import require_absent
     from tomopose.report import calibration_report, observations_report, write_report
@@ -39,11 +39,10 @@ def report(
     observations = tp.read_observations(observations_file) if observations_file.exists() else None
     sequence = None if poses is None else tp.read_poses(poses)
     calibration = tp.read_calibration(calibration_file) if calibration_file.exists() else None
-    pictures = []
+    pictures: tuple[Any, ...] = ()
     if images is not None and observations is not None and calibration is not None and sequence is not None:
         stack = open_for(say, image_source(images), calibration.scanner, sequence)
-        residual = dict(zip(calibration.pose_id, calibration.d.tolist(), strict=True))
-        pictures = thumbnails(observations, stack, residual)
+        pictures = worst(calibration, observations, stack)
     if calibration is not None:
         matrices = None if scan is None else tp.read_matrices(scan)
         html = calibration_report(

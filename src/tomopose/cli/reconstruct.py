@@ -1,0 +1,120 @@
+"""`tomopose reconstruct`: matrices and radiographs to a volume, with pictures of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from tomopose.cli.common import OK, ForceOption, JsonOption, QuietOption, Say, arguments, names
+
+EPILOG = (
+    "Example: tomopose reconstruct --matrices matrices.npz --images scan/ --images-are transmission --voxel-mm 0.1 "
+    "--size 512 --out volume.h5"
+)
+
+PICTURES = ("slice_z", "slice_y", "slice_x", "maximum")
+
+
+def register(app: typer.Typer) -> None:
+    app.command("reconstruct", epilog=EPILOG)(reconstruct)
+
+
+def grid_size(text: str) -> tuple[int, int, int]:
+    """`512` or `512,512,300` (x, y, z) as the array's shape (z, y, x)."""
+    parts = names(text)
+    if len(parts) not in (1, 3) or not all(p.isdigit() and int(p) > 0 for p in parts):
+        raise typer.BadParameter(f"{text!r} is neither N nor NX,NY,NZ", param_hint="--size")
+    x, y, z = (int(p) for p in (parts * 3 if len(parts) == 1 else parts))
+    return z, y, x
+
+
+def pictures(volume: Any) -> dict[str, bytes]:
+    """PNGs of the three middle slices and of the maximum projection, z or y upwards."""
+    from tomopose.report.png import grey_levels, grey_png
+
+    images = (*volume.slices(), volume.maximum_projection())
+    return {name: grey_png(grey_levels(image)[::-1].copy()) for name, image in zip(PICTURES, images, strict=True)}
+
+
+def reconstruct(
+    matrices: Annotated[Path, typer.Option("--matrices", help="matrices.npz of the scan.")],
+    images: Annotated[str, typer.Option("--images", help="Folder, glob or multi-page file of the scan's images.")],
+    voxel: Annotated[float, typer.Option("--voxel-mm", help="Voxel side, mm.")],
+    size: Annotated[str, typer.Option("--size", help="Voxels along each axis, N or NX,NY,NZ.")],
+    out: Annotated[Path, typer.Option("--out", help="volume.h5 (also .nrrd, .mhd, .tif).")],
+    images_are: Annotated[
+        str | None, typer.Option("--images-are", help="counts, transmission or line-integrals; never guessed.")
+    ] = None,
+    white: Annotated[
+        float | None, typer.Option("--white", help="Grey value of the open beam, for counts without --flat.")
+    ] = None,
+    dark: Annotated[str | None, typer.Option("--dark", help="Dark frames, with --flat.")] = None,
+    flat: Annotated[str | None, typer.Option("--flat", help="Flat frames: images become transmission.")] = None,
+    engine: Annotated[str, typer.Option("--engine", help="auto, cpu, rtk, astra or reference.")] = "auto",
+    algorithm: Annotated[
+        str, typer.Option("--algorithm", help="fdk+sart, sart, ossart, fdk, fdk-preview or cgls.")
+    ] = "fdk+sart",
+    paper: Annotated[bool, typer.Option("--paper", help="As the paper: one SART iteration, relaxation 0.8.")] = False,
+    iterations: Annotated[int | None, typer.Option("--iterations", min=1, help="Sweeps over all views.")] = None,
+    relaxation: Annotated[float, typer.Option("--relaxation", help="Above 0 and below 2.")] = 0.8,
+    order: Annotated[str, typer.Option("--order", help="golden, sequential or random.")] = "golden",
+    nonnegative: Annotated[bool, typer.Option("--nonnegative", help="Keep attenuation at 0 or above.")] = False,
+    memory: Annotated[float | None, typer.Option("--memory-gib", help="Keep within this much memory.")] = None,
+    checkpoint: Annotated[
+        Path | None, typer.Option("--checkpoint", help="Folder to keep the state in; a second run goes on from there.")
+    ] = None,
+    dask: Annotated[str | None, typer.Option("--dask", help="Address of a dask scheduler for slabs.")] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """Reconstruct a scan along any path, on the CPU or through another engine.
+
+    The volume lies in W, object at home.  How well each view agrees with the volume is stated: a wrong trajectory shows
+    there without any reference part.
+    """
+    from dataclasses import replace
+
+    import numpy as np
+
+    import tomopose as tp
+    from tomopose.cli.job import executor_of, image_source
+    from tomopose.files import atomic_file, require_absent
+    from tomopose.provenance import provenance
+
+    say = Say(json=as_json, quiet=quiet)
+    shape = grid_size(size)
+    target = require_absent(out, force=force)
+    shown = {name: require_absent(out.with_name(f"{out.stem}_{name}.png"), force=force) for name in PICTURES}
+    P = tp.read_matrices(matrices)
+    stack = tp.open_images(image_source(images), dark=dark, flat=flat)
+    for warning in stack.warnings:
+        say.note(f"note: {warning}")
+    choice: dict[str, Any] = {"algorithm": algorithm, "iterations": iterations, "relaxation": relaxation}
+    if paper:
+        choice = {"algorithm": "sart", "iterations": 1, "relaxation": 0.8}
+    with say.progress("reconstructing") as progress, executor_of(dask) as client:
+        volume = tp.reconstruct(
+            stack, P, tp.VoxelGrid(shape=shape, spacing=voxel), engine=engine, order=order, nonnegative=nonnegative,
+            images_are="transmission" if flat is not None and images_are is None else images_are, white=white,
+            memory_gib=memory, checkpoint=checkpoint, progress=progress, client=client, **choice,
+        )
+    made = provenance(
+        inputs=[matrices], arguments=arguments(voxel_mm=voxel, size=size, engine=engine, order=order, **choice)
+    )
+    volume = replace(volume, provenance=made)
+    tp.write_volume(volume, target, force=force)
+    for name, png in pictures(volume).items():
+        with atomic_file(shown[name]) as temporary:
+            temporary.write_bytes(png)
+    residual = None if volume.view_residual is None else float(np.median(volume.view_residual))
+    say.result(
+        {"out": out.name, "shape_zyx": list(shape), "voxel_mm": voxel, "median_view_residual": residual,
+         "notes": list(volume.notes), "settings": dict(volume.settings)},
+        [f"{out}: {shape[2]} x {shape[1]} x {shape[0]} voxels of {voxel:g} mm",
+         *([] if residual is None else [f"  residual of a view's reprojection, median: {residual:.3g}"]),
+         *(f"  note: {note}" for note in volume.notes)],
+    )
+    return OK
