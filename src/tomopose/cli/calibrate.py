@@ -9,14 +9,20 @@ import typer
 
 from tomopose.cli.common import (
     BallOption,
+    DarkOption,
+    DatasetOption,
+    FlatOption,
     ForceOption,
+    ImagesOption,
     JsonOption,
+    ObservationsOption,
     PosesOption,
     QuietOption,
     Say,
     ScannerOption,
     WorkersOption,
     arguments,
+    either,
     names,
 )
 
@@ -31,12 +37,8 @@ def calibrate(
     scanner: ScannerOption,
     poses: PosesOption,
     out: Annotated[Path, typer.Option("--out", help="Folder for calibration.json, observations.csv, report.html.")],
-    images: Annotated[
-        str | None, typer.Option("--images", help="Folder, glob or multi-page file of radiographs.")
-    ] = None,
-    observations: Annotated[
-        Path | None, typer.Option("--observations", help="observations.csv, instead of --images.")
-    ] = None,
+    images: ImagesOption = None,
+    observations: ObservationsOption = None,
     ball_diameter: BallOption = 8.0,
     manipulator: Annotated[
         Path | None, typer.Option("--manipulator", help="hexapod.json or robot.json: nominal geometry and its priors.")
@@ -50,9 +52,9 @@ def calibrate(
     fix: Annotated[
         str | None, typer.Option("--fix", help="Parameters to hold although scanner.json gives them a sigma.")
     ] = None,
-    dark: Annotated[str | None, typer.Option("--dark", help="Dark frames, with --flat.")] = None,
-    flat: Annotated[str | None, typer.Option("--flat", help="Flat frames: detect on the transmission.")] = None,
-    dataset: Annotated[str | None, typer.Option("--dataset", help="Dataset in an HDF5 file.")] = None,
+    dark: DarkOption = None,
+    flat: FlatOption = None,
+    dataset: DatasetOption = None,
     workers: WorkersOption = 1,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -76,8 +78,7 @@ def calibrate(
     )
     from tomopose.provenance import provenance
 
-    if (images is None) == (observations is None):
-        raise typer.BadParameter("give either --images or --observations", param_hint="--images / --observations")
+    either(images, observations)
     say = Say(json=as_json, quiet=quiet)
     require_free_folder(out, force=force)
     geometry, sequence = tp.read_scanner(scanner), tp.read_poses(poses)

@@ -23,6 +23,16 @@ ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite files that
 ScannerOption = Annotated[Path, typer.Option("--scanner", help="scanner.json: the scanner's known geometry.")]
 PosesOption = Annotated[Path, typer.Option("--poses", help="poses.csv: the manipulator's poses, one row an image.")]
 WorkersOption = Annotated[int, typer.Option("--workers", min=1, help="Processes to use.")]
+ImagesOption = Annotated[
+    str | None, typer.Option("--images", help="Folder, glob or multi-page file of radiographs.")
+]
+ObservationsOption = Annotated[
+    Path | None, typer.Option("--observations", help="observations.csv, instead of --images.")
+]
+DarkOption = Annotated[str | None, typer.Option("--dark", help="Dark frames, with --flat.")]
+FlatOption = Annotated[str | None, typer.Option("--flat", help="Flat frames: images become transmission.")]
+DatasetOption = Annotated[str | None, typer.Option("--dataset", help="Dataset in an HDF5 file.")]
+DaskOption = Annotated[str | None, typer.Option("--dask", help="Address of a dask scheduler to use.")]
 BallOption = Annotated[float, typer.Option("--ball-diameter-mm", help="Nominal diameter of the ball, mm.")]
 
 
@@ -84,6 +94,12 @@ def _lines(label: str) -> Progress:
             print(f"{label}: {done} of {total}{left}", file=sys.stderr, flush=True)
 
     return update
+
+
+def either(images: str | None, observations: Path | None) -> None:
+    """A usage error unless exactly one of the two is given."""
+    if (images is None) == (observations is None):
+        raise typer.BadParameter("give either --images or --observations", param_hint="--images / --observations")
 
 
 def names(text: str | None) -> tuple[str, ...]:

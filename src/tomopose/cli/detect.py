@@ -10,6 +10,10 @@ import typer
 from tomopose.cli.common import (
     OK,
     BallOption,
+    DarkOption,
+    DaskOption,
+    DatasetOption,
+    FlatOption,
     ForceOption,
     JsonOption,
     QuietOption,
@@ -20,8 +24,6 @@ from tomopose.cli.common import (
 
 EPILOG = "Example: tomopose detect --scanner scanner.json --images 'run/*.tif' --poses poses.csv --out observations.csv"
 
-ImagesOption = Annotated[str, typer.Option("--images", help="Folder, glob or multi-page file of radiographs.")]
-
 
 def register(app: typer.Typer) -> None:
     app.command("detect", epilog=EPILOG)(detect)
@@ -29,17 +31,17 @@ def register(app: typer.Typer) -> None:
 
 def detect(
     scanner: ScannerOption,
-    images: ImagesOption,
+    images: Annotated[str, typer.Option("--images", help="Folder, glob or multi-page file of radiographs.")],
     out: Annotated[Path, typer.Option("--out", help="observations.csv to write.")],
     poses: Annotated[
         Path | None, typer.Option("--poses", help="poses.csv; gives the pose ids. Without it: the images' names.")
     ] = None,
     ball_diameter: BallOption = 8.0,
-    dark: Annotated[str | None, typer.Option("--dark", help="Dark frames, with --flat.")] = None,
-    flat: Annotated[str | None, typer.Option("--flat", help="Flat frames: detect on the transmission.")] = None,
-    dataset: Annotated[str | None, typer.Option("--dataset", help="Dataset in an HDF5 file.")] = None,
+    dark: DarkOption = None,
+    flat: FlatOption = None,
+    dataset: DatasetOption = None,
     workers: WorkersOption = 1,
-    dask: Annotated[str | None, typer.Option("--dask", help="Address of a dask scheduler to use instead.")] = None,
+    dask: DaskOption = None,
     resume: Annotated[
         Path | None, typer.Option("--resume", help="Journal of finished images: go on where a run was interrupted.")
     ] = None,

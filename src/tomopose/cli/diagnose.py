@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 
 from tomopose.cli.common import (
     NOT_TRUSTWORTHY,
     OK,
     BallOption,
+    ImagesOption,
     JsonOption,
+    ObservationsOption,
     PosesOption,
     QuietOption,
     Say,
     ScannerOption,
     WorkersOption,
+    either,
 )
 
 EPILOG = "Example: tomopose diagnose --scanner scanner.json --poses poses.csv --observations observations.csv"
@@ -31,12 +31,8 @@ def register(app: typer.Typer) -> None:
 def diagnose(
     scanner: ScannerOption,
     poses: PosesOption,
-    images: Annotated[
-        str | None, typer.Option("--images", help="Folder, glob or multi-page file of radiographs.")
-    ] = None,
-    observations: Annotated[
-        Path | None, typer.Option("--observations", help="observations.csv, instead of --images.")
-    ] = None,
+    images: ImagesOption = None,
+    observations: ObservationsOption = None,
     ball_diameter: BallOption = 8.0,
     workers: WorkersOption = 1,
     as_json: JsonOption = False,
@@ -50,8 +46,7 @@ def diagnose(
     import tomopose as tp
     from tomopose.cli.job import image_source, observe, open_for
 
-    if (images is None) == (observations is None):
-        raise typer.BadParameter("give either --images or --observations", param_hint="--images / --observations")
+    either(images, observations)
     say = Say(json=as_json, quiet=quiet)
     geometry, sequence = tp.read_scanner(scanner), tp.read_poses(poses)
     if observations is not None:

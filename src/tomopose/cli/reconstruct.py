@@ -7,7 +7,18 @@ from typing import Annotated, Any
 
 import typer
 
-from tomopose.cli.common import OK, ForceOption, JsonOption, QuietOption, Say, arguments, names
+from tomopose.cli.common import (
+    OK,
+    DarkOption,
+    DaskOption,
+    FlatOption,
+    ForceOption,
+    JsonOption,
+    QuietOption,
+    Say,
+    arguments,
+    names,
+)
 
 EPILOG = (
     "Example: tomopose reconstruct --matrices matrices.npz --images scan/ --images-are transmission --voxel-mm 0.1 "
@@ -50,8 +61,8 @@ def reconstruct(
     white: Annotated[
         float | None, typer.Option("--white", help="Grey value of the open beam, for counts without --flat.")
     ] = None,
-    dark: Annotated[str | None, typer.Option("--dark", help="Dark frames, with --flat.")] = None,
-    flat: Annotated[str | None, typer.Option("--flat", help="Flat frames: images become transmission.")] = None,
+    dark: DarkOption = None,
+    flat: FlatOption = None,
     engine: Annotated[str, typer.Option("--engine", help="auto, cpu, rtk, astra or reference.")] = "auto",
     algorithm: Annotated[
         str, typer.Option("--algorithm", help="fdk+sart, sart, ossart, fdk, fdk-preview or cgls.")
@@ -65,7 +76,7 @@ def reconstruct(
     checkpoint: Annotated[
         Path | None, typer.Option("--checkpoint", help="Folder to keep the state in; a second run goes on from there.")
     ] = None,
-    dask: Annotated[str | None, typer.Option("--dask", help="Address of a dask scheduler for slabs.")] = None,
+    dask: DaskOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
