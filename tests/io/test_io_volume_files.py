@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
+from tomopose.engines import rtk
 from tomopose.errors import FileError, SchemaVersionError
 from tomopose.io.volume_files import read_volume, write_volume
 from tomopose.provenance import provenance
@@ -54,7 +55,9 @@ def test_hdf5_keeps_all_that_a_volume_knows(volume, tmp_path):
 @pytest.mark.authority
 @pytest.mark.parametrize("suffix", [".nrrd", ".mhd"])
 def test_itk_sees_the_same_place(suffix, volume, tmp_path):
-    itk = pytest.importorskip("itk")
+    if not rtk.availability().available:
+        pytest.skip(rtk.availability().reason)
+    itk, _ = rtk.load_itk()
     image = itk.imread(str(write_volume(volume, tmp_path / f"v{suffix}")))
     assert np.allclose(list(image.GetOrigin()), volume.grid.origin, atol=1e-12)
     assert np.allclose(list(image.GetSpacing()), volume.grid.spacing, atol=1e-12)

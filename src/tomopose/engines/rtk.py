@@ -7,6 +7,7 @@ of views that go in and come out.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -46,11 +47,23 @@ def panel_origin(matrices: ProjectionMatrices) -> tuple[float, float]:
     return -(matrices.n_u - 1) / 2 * matrices.p_u, -(matrices.n_v - 1) / 2 * matrices.p_v
 
 
+def load_itk() -> tuple[Any, Any]:
+    """The modules itk and itk.RTK.
+
+    SWIG's types raise a DeprecationWarning while they are made, and where warnings are errors that ends the process.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        import itk
+        from itk import RTK
+
+        itk.imread, itk.imwrite, RTK.ThreeDCircularProjectionGeometry  # noqa: B018  (itk loads on first use)
+    return itk, RTK
+
+
 def rtk_geometry(matrices: ProjectionMatrices, views: Sequence[int]) -> Any:
     """RTK's geometry object of those views; EngineFailedError names a view that RTK refuses."""
-    import itk
-    from itk import RTK
-
+    itk, RTK = load_itk()
     require_views(views, len(matrices))
     geometry = RTK.ThreeDCircularProjectionGeometry.New()
     M = rtk_matrices(matrices)
@@ -58,7 +71,7 @@ def rtk_geometry(matrices: ProjectionMatrices, views: Sequence[int]) -> Any:
         matrix = itk.Matrix[itk.D, 3, 4](itk.vnl_matrix_from_array(np.ascontiguousarray(M[j])))
         if geometry.AddProjection(matrix) is False:
             raise EngineFailedError(f"RTK refuses the matrix of view {j}")
-    found = len(geometry.GetMatrices())
+    found = len(geometry.GetGantryAngles())
     if found != len(views):
         raise EngineFailedError(f"RTK holds {found} of {len(views)} views")
     return geometry
@@ -75,11 +88,8 @@ class RtkEngine:
     def __init__(
         self, matrices: ProjectionMatrices, grid: VoxelGrid, *, support: np.ndarray | None = None
     ) -> None:
-        import itk
-        from itk import RTK
-
-        self._itk, self._rtk = itk, RTK
-        self._kind = itk.Image[itk.F, 3]
+        self._itk, self._rtk = load_itk()
+        self._kind = self._itk.Image[self._itk.F, 3]
         self.matrices, self.grid = matrices, grid
         self._support = require_support(support, grid)
         self._distance = matrices.decompose().d_SD
