@@ -18,6 +18,8 @@ from tomopose.cli.common import (
     ObservationsOption,
     PosesOption,
     QuietOption,
+    RawOption,
+    RowsOption,
     Say,
     ScannerOption,
     WorkersOption,
@@ -55,6 +57,8 @@ def calibrate(
     dark: DarkOption = None,
     flat: FlatOption = None,
     dataset: DatasetOption = None,
+    rows: RowsOption = None,
+    raw: RawOption = None,
     workers: WorkersOption = 1,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -87,7 +91,10 @@ def calibrate(
     if observations is not None:
         observed = tp.read_observations(observations)
     else:
-        stack = open_for(say, image_source(str(images)), geometry, sequence, dark=dark, flat=flat, dataset=dataset)
+        stack = open_for(
+            say, image_source(str(images)), geometry, sequence,
+            dark=dark, flat=flat, dataset=dataset, rows=rows, raw=raw,
+        )
         observed = observe(say, geometry, stack, sequence, ball_diameter=ball_diameter, workers=workers)
     result = tp.calibrate(
         geometry, sequence, observed, manipulator=errors, model=model, free=names(free), fix=names(fix)

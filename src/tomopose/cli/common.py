@@ -32,6 +32,13 @@ ObservationsOption = Annotated[
 DarkOption = Annotated[str | None, typer.Option("--dark", help="Dark frames, with --flat.")]
 FlatOption = Annotated[str | None, typer.Option("--flat", help="Flat frames: images become transmission.")]
 DatasetOption = Annotated[str | None, typer.Option("--dataset", help="Dataset in an HDF5 file.")]
+RowsOption = Annotated[
+    str | None, typer.Option("--rows", help="Row order of the image files where scanner.json is silent: top-first or "
+                             "bottom-first.")
+]
+RawOption = Annotated[
+    str | None, typer.Option("--raw", help="Layout of RAW files, NVxNU:TYPE[:HEADER_BYTES], e.g. 2048x2048:<u2:512.")
+]
 DaskOption = Annotated[str | None, typer.Option("--dask", help="Address of a dask scheduler to use.")]
 BallOption = Annotated[float, typer.Option("--ball-diameter-mm", help="Nominal diameter of the ball, mm.")]
 

@@ -17,6 +17,8 @@ from tomopose.cli.common import (
     ForceOption,
     JsonOption,
     QuietOption,
+    RawOption,
+    RowsOption,
     Say,
     ScannerOption,
     WorkersOption,
@@ -40,6 +42,8 @@ def detect(
     dark: DarkOption = None,
     flat: FlatOption = None,
     dataset: DatasetOption = None,
+    rows: RowsOption = None,
+    raw: RawOption = None,
     workers: WorkersOption = 1,
     dask: DaskOption = None,
     resume: Annotated[
@@ -61,7 +65,8 @@ def detect(
     require_absent(out, force=force)
     geometry = tp.read_scanner(scanner)
     sequence = None if poses is None else tp.read_poses(poses)
-    stack = open_for(say, image_source(images), geometry, sequence, dark=dark, flat=flat, dataset=dataset)
+    stack = open_for(say, image_source(images), geometry, sequence, dark=dark, flat=flat, dataset=dataset, rows=rows,
+                         raw=raw)
     with executor_of(dask) as executor:
         found = observe(
             say, geometry, stack, sequence, ball_diameter=ball_diameter, workers=workers, executor=executor,

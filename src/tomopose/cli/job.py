@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import typer
+
 from tomopose.cli.common import NOT_TRUSTWORTHY, OK, Say
+
+RAW = re.compile(r"(?P<n_v>\d+)x(?P<n_u>\d+):(?P<dtype>[^:]+)(:(?P<header>\d+))?")
 
 if TYPE_CHECKING:
     from tomopose import BallObservations, Calibration, PoseSequence, ProjectionMatrices, Scanner
@@ -20,6 +25,20 @@ def image_source(text: str) -> str | Path:
     return text if any(c in text for c in "*?[") else Path(text)
 
 
+def raw_layout(text: str | None) -> Any:
+    """`2048x2048:<u2:512` as a RawLayout: rows x columns, type with endianness, bytes of header."""
+    import tomopose as tp
+
+    if text is None:
+        return None
+    found = RAW.fullmatch(text)
+    if not found:
+        raise typer.BadParameter(f"{text!r} is not NVxNU:TYPE[:HEADER_BYTES]", param_hint="--raw")
+    return tp.RawLayout(
+        shape=(int(found["n_v"]), int(found["n_u"])), dtype=found["dtype"], header=int(found["header"] or 0)
+    )
+
+
 def open_for(
     say: Say,
     source: str | Path,
@@ -29,11 +48,18 @@ def open_for(
     dark: str | None = None,
     flat: str | None = None,
     dataset: str | None = None,
+    rows: str | None = None,
+    raw: str | None = None,
 ) -> Any:
     """The images of a pose table, in its order; without a table, all images in natural order."""
     import tomopose as tp
 
-    images = tp.open_images(source, scanner, dark=dark, flat=flat, dataset=dataset)
+    if rows not in (None, "top-first", "bottom-first"):
+        raise typer.BadParameter(f"{rows!r} is neither top-first nor bottom-first", param_hint="--rows")
+    order: Any = rows
+    images = tp.open_images(
+        source, scanner, dark=dark, flat=flat, dataset=dataset, rows=order, raw_layout=raw_layout(raw)
+    )
     for warning in images.warnings:
         say.note(f"note: {warning}")
     return images if poses is None else images.select(tp.pair_images(poses, images))

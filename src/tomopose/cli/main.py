@@ -25,6 +25,7 @@ VERBS = (
     "calibrate",
     "diagnose",
     "plan",
+    "import_poses",
     "matrices",
     "export",
     "import_geometry",
