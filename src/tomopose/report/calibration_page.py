@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.result import Calibration
+from tomopose.calibration.result import Calibration, Parameter
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
@@ -44,7 +44,15 @@ from tomopose.units import value_with_uncertainty
 
 TONES: Mapping[str, Any] = {"trustworthy": GOOD, "doubtful": CARE, "rejected": BAD}
 COVERAGE_FACTOR = 2.0
-HYPOTHESIS_COLUMNS = ("words", "name", "verdict", "d_rms_px", "delta_chi2", "cure")
+HYPOTHESIS_COLUMNS = ("words", "verdict", "d_rms_px", "delta_chi2", "cure")
+NO_DOUBT: Mapping[str, tuple[str, ...]] = {
+    "trustworthy": ("none of the checks gave a reason for doubt",),
+    "doubtful": (),
+    "rejected": (),
+}
+MANY_PARAMETERS = 12
+MACHINE_LISTS = ("names", "values", "units", "u", "nominal")
+"""Parts of `Calibration.manipulator` that stand in the tables of parameters already, or in its input file."""
 
 
 def calibration_report(
@@ -104,7 +112,7 @@ def _verdict(calibration: Calibration) -> Verdict:
         word=calibration.verdict.capitalize(),
         sentence=sentence,
         tone=TONES[calibration.verdict],
-        reasons=calibration.reasons,
+        reasons=calibration.reasons or NO_DOUBT[calibration.verdict],
     )
 
 
@@ -139,36 +147,31 @@ def _key_figures(calibration: Calibration, scan: ProjectionMatrices | None) -> l
 
 
 def _parameters(calibration: Calibration) -> Section:
-    rows = []
-    for p in calibration.parameters:
-        degrees = f"{np.degrees(p.value):.6f}°" if p.unit == "rad" else ""
-        rows.append(
-            [p.name, meaning(p.name), value_with_uncertainty(p.value, p.u, p.unit), degrees, small_unit(p.u, p.unit),
-             small_unit(COVERAGE_FACTOR * p.u, p.unit)]
-        )
+    names = calibration.manipulator.get("names")
+    machine = set(names) if isinstance(names, (list, tuple)) else set()
     T_HT = calibration.T_HT
     blocks: list[Block] = [
-        Table(
+        _parameter_table(
+            [p for p in calibration.parameters if p.name not in machine],
             title="Parameters",
-            meaning="The figures in brackets are the standard uncertainty in units of the last digits; U is the "
-            "expanded uncertainty, k = 2.",
-            columns=["parameter", "what it is", "value", "in degrees", "u", "U (k = 2)"],
-            rows=rows,
-            numeric=(2, 3, 4, 5),
+            words="The figures in brackets are the standard uncertainty in units of the last digits; U is the expanded "
+            "uncertainty, k = 2.",
         ),
         _transform_table(T_HT, "T_HT: from the manipulator's base H to the table T"),
         _transform_table(T_HT.inv, "T_TH: from the table T to the manipulator's base H"),
     ]
-    if calibration.manipulator:
+    errors = [p for p in calibration.parameters if p.name in machine]
+    if errors:
         blocks.append(
-            Table(
-                title="Identified errors of the manipulator",
-                meaning="Numbers that the model found beside the mount.",
-                columns=["name", "value"],
-                rows=[[k, cell(v)] for k, v in calibration.manipulator.items()],
-                folded=len(calibration.manipulator) > 12,
+            _parameter_table(
+                errors, title="Identified errors of the manipulator",
+                words="What the model found beside the mount, as corrections of the machine's stated geometry. Errors "
+                "that the poses cannot tell stay near zero with the uncertainty of their prior.",
             )
         )
+    facts = [[heading(k), cell(v)] for k, v in calibration.manipulator.items() if k not in MACHINE_LISTS]
+    if facts:
+        blocks.append(Table(title="The manipulator's model", meaning="", columns=["", ""], rows=facts))
     pivot = NOT_GIVEN if calibration.pivot is None else ", ".join(f"{x:.4f}" for x in calibration.pivot) + " mm"
     blocks.append(
         Words(
@@ -180,6 +183,20 @@ def _parameters(calibration: Calibration) -> Section:
     )
     return Section(title="What was found", lead="How the manipulator sits on the table, and where the ball is.",
                    blocks=blocks)
+
+
+def _parameter_table(parameters: Sequence[Parameter], *, title: str, words: str) -> Table:
+    rows = []
+    for p in parameters:
+        degrees = f"{np.degrees(p.value):.6f}°" if p.unit == "rad" else ""
+        rows.append(
+            [p.name, meaning(p.name), value_with_uncertainty(p.value, p.u, p.unit), degrees, small_unit(p.u, p.unit),
+             small_unit(COVERAGE_FACTOR * p.u, p.unit)]
+        )
+    return Table(
+        title=title, meaning=words, columns=["parameter", "what it is", "value", "in degrees", "u", "U (k = 2)"],
+        rows=rows, numeric=(2, 3, 4, 5), folded=len(rows) > 2 * MANY_PARAMETERS,
+    )
 
 
 def _transform_table(T: RigidTransform, title: str) -> Table:
@@ -314,10 +331,18 @@ def _hypotheses(hypotheses: Sequence[Mapping[str, Any]]) -> list[Block]:
             tables.append(
                 Table(
                     title=title, meaning=words, columns=[heading(c) for c in columns],
-                    rows=[[cell(row.get(c)) for c in columns] for row in rows], folded=rows is excluded,
+                    rows=[[_hypothesis_cell(c, row.get(c)) for c in columns] for row in rows],
+                    folded=rows is excluded,
                 )
             )
     return list(tables)
+
+
+def _hypothesis_cell(column: str, value: Any) -> str:
+    """Differences of chi2 need no more than a decimal: what is below one is nothing."""
+    if column == "delta_chi2" and value is not None and abs(value) < 1e4:
+        return f"{value:.1f}".replace("-0.0", "0.0")
+    return cell(value)
 
 
 def _coverage(calibration: Calibration, joined: Joined, observations: BallObservations | None) -> Section:

@@ -186,19 +186,27 @@ def correlation_map(calibration: Calibration) -> Figure:
 def singular_values(calibration: Calibration) -> Figure:
     """Singular values of the scaled Jacobian."""
     s = np.asarray(calibration.observability.singular_values, dtype=np.float64)
+    words = (
+        "below 100 is healthy, and a last bar that falls off by orders of magnitude is a direction the poses cannot "
+        "tell."
+        if calibration.model == "rigid"
+        else "a long tail is normal where a manipulator's errors are estimated: priors hold what the poses cannot tell."
+    )
+    wide_range = s.size > 0 and s.min() > 0 and s.max() / s.min() > 200
     return Figure(
         title="Singular values",
         meaning="How strongly the data hold each independent direction of the parameters, strongest first.",
-        look_for=f"Their ratio is the condition number, here {calibration.observability.condition:.3g}; below 100 is "
-        "healthy, and a last bar that falls off by orders of magnitude is a direction the poses cannot tell.",
+        look_for=f"Their ratio is the condition number, here {calibration.observability.condition:.3g}; {words}",
         data=[
             {
-                "type": "bar", "x": [str(k) for k in range(1, s.size + 1)], "y": np.where(s > 0, s, np.nan),
+                "type": "bar", "x": np.arange(1, s.size + 1), "y": np.where(s > 0, s, np.nan),
                 "marker": {"color": ACCENT}, "hovertemplate": "%{y:.4g}<extra></extra>",
             }
         ],
         layout=layout(
-            xaxis=axis("direction", type="category"), yaxis=axis("singular value", type="log", dtick="D2"), bargap=0.45
+            xaxis=axis("direction", dtick=1 if s.size <= 16 else 5),
+            yaxis=axis("singular value", type="log", dtick=1 if wide_range else "D2"),
+            bargap=0.45,
         ),
         height=440,
         wide=False,

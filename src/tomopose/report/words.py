@@ -43,6 +43,9 @@ GREEK = (("phi_", "φ_"), ("w_", "ω_"), ("eta", "η"), ("theta", "θ"), ("phi",
 AXIS_NAME = re.compile(r"(?P<stem>phi_HT|w_HT|t_HT|t)(?:\[(?P<ball>-?\d+)\])?_(?P<axis>[xyz])")
 
 
+LONGEST_SYMBOL = 8
+
+
 def meaning(name: str) -> str:
     """What a parameter is, in words; empty where it is not known here."""
     found = AXIS_NAME.fullmatch(name)
@@ -59,6 +62,8 @@ def symbol(name: str) -> str:
         if text.startswith(plain_name):
             text = greek + text[len(plain_name):]
             break
+    if len(text) > LONGEST_SYMBOL:
+        return text.replace("_", " ")
     stem, _, index = text.partition("_")
     return f"{stem}<sub>{index.replace('_', ',')}</sub>" if index else stem
 
