@@ -33,8 +33,8 @@ DarkOption = Annotated[str | None, typer.Option("--dark", help="Dark frames, wit
 FlatOption = Annotated[str | None, typer.Option("--flat", help="Flat frames: images become transmission.")]
 DatasetOption = Annotated[str | None, typer.Option("--dataset", help="Dataset in an HDF5 file.")]
 RowsOption = Annotated[
-    str | None, typer.Option("--rows", help="Row order of the image files where scanner.json is silent: top-first or "
-                             "bottom-first.")
+    str | None, typer.Option("--rows", help="Row order of the image files, top-first or bottom-first; overrides "
+                             "scanner.json.")
 ]
 RawOption = Annotated[
     str | None, typer.Option("--raw", help="Layout of RAW files, NVxNU:TYPE[:HEADER_BYTES], e.g. 2048x2048:<u2:512.")
