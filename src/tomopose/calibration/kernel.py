@@ -219,6 +219,41 @@ def levenberg_marquardt(
     return chi2, OUT_OF_ITERATIONS
 
 
+@njit(cache=True)
+def _log_rotation(D: Array, out: Array) -> None:
+    """Rotation vector of D, angles below pi."""
+    c = min(max((D[0, 0] + D[1, 1] + D[2, 2] - 1.0) / 2.0, -1.0), 1.0)
+    v0, v1, v2 = (D[2, 1] - D[1, 2]) / 2.0, (D[0, 2] - D[2, 0]) / 2.0, (D[1, 0] - D[0, 1]) / 2.0
+    sine = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
+    f = 1.0 + sine * sine / 6.0 if sine < 1e-4 and c > 0 else math.atan2(sine, c) / sine
+    out[0], out[1], out[2] = f * v0, f * v1, f * v2
+
+
+@njit(cache=True)
+def _solve_one(
+    x: Array, W: Array, weight: Array, R_k: Array, t_k: Array, alpha: Array, run: Any, ball: Any, s_0: Array, cols: Any,
+    col_run: Any, factor: Array, information: Array, centre: Array, R_HT: Array, t_HT: Array, t: Array, delta: Array,
+    iterations: int, theta: Array,
+) -> tuple[float, int]:
+    """One solve from a start, its result written into theta (m,)."""
+    n_b, n_f = t.shape[0], cols.shape[0]
+    m = theta.shape[0]
+    R_b, t_HT_b, t_b, delta_b = R_HT.copy(), t_HT.copy(), t.copy(), delta - centre
+    s_b, N = s_0.copy(), np.zeros((m, m))
+    _scanner_vectors(s_0, cols, col_run, factor, centre, s_b)
+    chi2, status = levenberg_marquardt(
+        x, W, weight, R_k, t_k, alpha, run, ball, s_b, cols, col_run, factor, information, R_b, t_HT_b, t_b, delta_b,
+        iterations, N,
+    )
+    _log_rotation(R_b @ R_HT.T, theta)
+    theta[3:6] = t_HT_b
+    for j in range(n_b):
+        theta[6 + 3 * j:9 + 3 * j] = t_b[j]
+    for j in range(n_f):
+        theta[6 + 3 * n_b + j] = centre[j] + delta_b[j]
+    return chi2, status
+
+
 @njit(cache=True, parallel=True)
 def solve_batch(
     x_all: Array, W: Array, weight: Array, R_all: Array, t_all: Array, alpha: Array, run: Any, ball: Any, s_0: Array,
@@ -230,32 +265,13 @@ def solve_batch(
     prior (b or 1, f): centre of the prior of delta in each solve (a Monte Carlo draws it too).
     Returns theta (b, m): w (by which R = exp(w) R_HT of the start), t_HT, t ..., delta; chi2 (b,); status (b,).
     """
-    n_s, n_b, n_f = x_all.shape[0], t.shape[0], cols.shape[0]
-    m = 6 + 3 * n_b + n_f
+    n_s = x_all.shape[0]
+    m = 6 + 3 * t.shape[0] + cols.shape[0]
     theta, chi2, status = np.empty((n_s, m)), np.empty(n_s), np.empty(n_s, dtype=np.int64)
     for b in prange(n_s):
-        R_b, t_HT_b, t_b, delta_b = R_HT.copy(), t_HT.copy(), t.copy(), np.zeros(n_f)
-        s_b, N = s_0.copy(), np.zeros((m, m))
-        centre = prior[b if prior.shape[0] > 1 else 0]
-        _scanner_vectors(s_0, cols, col_run, factor, centre, s_b)
-        for j in range(n_f):
-            delta_b[j] = delta[j] - centre[j]
-        k = b if R_all.shape[0] > 1 else 0
-        chi2[b], status[b] = levenberg_marquardt(
-            x_all[b], W, weight, R_all[k], t_all[k], alpha, run, ball, s_b, cols, col_run, factor, information, R_b,
-            t_HT_b, t_b, delta_b, iterations, N,
+        i, j = b % prior.shape[0], b % R_all.shape[0]
+        chi2[b], status[b] = _solve_one(
+            x_all[b], W, weight, R_all[j], t_all[j], alpha, run, ball, s_0, cols, col_run, factor, information,
+            prior[i], R_HT, t_HT, t, delta, iterations, theta[b],
         )
-        # logarithm of R_b R_HT^T
-        D = R_b @ R_HT.T
-        c = min(max((D[0, 0] + D[1, 1] + D[2, 2] - 1.0) / 2.0, -1.0), 1.0)
-        v0, v1, v2 = (D[2, 1] - D[1, 2]) / 2.0, (D[0, 2] - D[2, 0]) / 2.0, (D[1, 0] - D[0, 1]) / 2.0
-        sine = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-        f = 1.0 + sine * sine / 6.0 if sine < 1e-4 and c > 0 else math.atan2(sine, c) / sine
-        theta[b, 0], theta[b, 1], theta[b, 2] = f * v0, f * v1, f * v2
-        for i in range(3):
-            theta[b, 3 + i] = t_HT_b[i]
-            for j in range(n_b):
-                theta[b, 6 + 3 * j + i] = t_b[j, i]
-        for j in range(n_f):
-            theta[b, 6 + 3 * n_b + j] = centre[j] + delta_b[j]
     return theta, chi2, status

@@ -15,6 +15,7 @@ from tomopose.calibration.parameters import base_name
 from tomopose.calibration.residuals import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.result import Calibration
 from tomopose.geometry.frames import Frame
+from tomopose.geometry.projection import eq5_matrices
 from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
@@ -75,12 +76,6 @@ def matrix_point_sigma(calibration: Calibration, poses: PoseSequence, x_W: Any) 
     return np.sqrt(np.maximum(V.mean(axis=2), 0.0))
 
 
-def matrix_point_sigma_um(calibration: Calibration, poses: PoseSequence, x_W: Any) -> Array:
-    """(n, m) um: the same uncertainty carried back to the object, pixels times pitch over magnification."""
-    s = calibration.scanner
-    return matrix_point_sigma(calibration, poses, x_W) * np.sqrt(s.p_u * s.p_v) / s.magnification * 1000.0
-
-
 def tilt_sigma(calibration: Calibration, tilt: float = TILT) -> float:
     """px: predicted standard uncertainty over the field of view (rms) of a scan tilted by `tilt` rad, table still."""
     w = tilt * np.concatenate([np.eye(3), -np.eye(3)])
@@ -88,3 +83,34 @@ def tilt_sigma(calibration: Calibration, tilt: float = TILT) -> float:
     poses = PoseSequence(T_MH=T_MH, pose_id=tuple("abcdef"))
     sigma = matrix_point_sigma(calibration, poses, field_of_view_points(calibration.scanner))
     return float(np.sqrt(np.mean(sigma**2)))
+
+
+def apparent_displacement(calibration: Calibration, poses: PoseSequence, x_W: Any) -> Array:
+    """(m, 3, c) mm: where points x_W (m, 3) come to lie in a reconstruction, by the calibration's errors.
+
+    A point is reconstructed where its images under the wrong matrices fit best: G dx = -J e in the least squares over
+    all views, G the derivative of the pixels by the point and J by the calibration.
+    """
+    x = np.asarray(x_W, dtype=np.float64)
+    J = matrix_point_jacobian(calibration, poses, x)
+    P = eq5_matrices(calibration.scanner, T_HT=calibration.T_HT, T_MH=poses.T_MH, alpha=_alpha(poses))
+    h = np.einsum("nij,mj->nmi", P[:, :, :3], x) + P[:, None, :, 3]
+    G = (P[:, None, :2, :3] - (h[..., :2] / h[..., 2:])[..., None] * P[:, None, 2:, :3]) / h[..., 2:, None]
+    N = np.einsum("nmia,nmib->mab", G, G)
+    return -np.linalg.solve(N, np.einsum("nmia,nmic->mac", G, J))
+
+
+def object_sigma(calibration: Calibration, poses: PoseSequence, x_W: Any) -> Array:
+    """(m, 3) mm: standard uncertainty of each coordinate of points x_W (m, 3) in a reconstruction of this scan."""
+    B = apparent_displacement(calibration, poses, x_W)
+    return np.sqrt(np.einsum("mac,cd,mad->ma", B, calibration.covariance, B))
+
+
+def length_sigma(calibration: Calibration, poses: PoseSequence, x_a: Any, x_b: Any) -> Array:
+    """(m,) mm: standard uncertainty, from the calibration alone, of the lengths between points x_a and x_b (m, 3) of W
+    in a reconstruction of this scan."""
+    a, b = np.atleast_2d(np.asarray(x_a, dtype=np.float64)), np.atleast_2d(np.asarray(x_b, dtype=np.float64))
+    along = (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True)
+    B = apparent_displacement(calibration, poses, b) - apparent_displacement(calibration, poses, a)
+    g = np.einsum("ma,mac->mc", along, B)
+    return np.sqrt(np.einsum("mc,cd,md->m", g, calibration.covariance, g))
