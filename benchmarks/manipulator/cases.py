@@ -22,6 +22,7 @@ SCANNER = Scanner(
 """Magnification 5.3 of the paper."""
 DETECTION_PX = 0.0207
 """rms distance of detected centres from the true ones, table 1: both coordinates together."""
+ROBOT_BALLS = np.array([[20.0, -15.0, 60.0], [-22.0, 10.0, 20.0]])
 UM_PER_PX = 200.0 / SCANNER.magnification
 
 
@@ -42,10 +43,13 @@ def mixed_poses(rng: np.random.Generator, *, n: int = 189, balls: int = 1) -> Po
     )
 
 
-def tilted_scan(T_HT: RigidTransform, *, n: int = 180) -> PoseSequence:
-    """The paper's 3D scan: eq. (10) with the triangle wave of eq. (11), 8 deg."""
+def tilted_scan(T_HT: RigidTransform, *, n: int = 180, wide: bool = False) -> PoseSequence:
+    """The paper's 3D scans, eq. (10): 1 deg + 4 deg sin 7 alpha; wide: the triangle wave of eq. (11), 8 deg, which leaves
+    the calibrated tilts of 5 deg."""
     alpha = np.arange(n) * 2 * np.pi / n
-    tilt = 28 / 45 * np.abs((alpha + np.pi / 14) % (2 * np.pi / 7) - np.pi / 7) - 2 * np.pi / 45
+    tilt = np.radians(1 + 4 * np.sin(7 * alpha))
+    if wide:
+        tilt = 28 / 45 * np.abs((alpha + np.pi / 14) % (2 * np.pi / 7) - np.pi / 7) - 2 * np.pi / 45
     turn = R_z(alpha)
     R = T_HT.R.T @ np.swapaxes(turn, 1, 2) @ R_y(tilt) @ turn @ T_HT.R
     return PoseSequence(
@@ -70,7 +74,7 @@ class Experiment:
 def experiment(
     machine: Any, p: Any, poses: PoseSequence, scan: PoseSequence, *, T_HT: RigidTransform, balls: Any,
     rng: np.random.Generator, believed: Any = None, disturbance: Disturbance | None = None, scanner: Scanner = SCANNER,
-    scan_disturbed: bool = False, centre: Any = None,
+    centre: Any = None,
 ) -> Experiment:
     """Image the balls on the real machine; the scan is executed by the same machine.
 
@@ -85,7 +89,7 @@ def experiment(
     observations = BallObservations.from_sigma(
         x + sigma * rng.standard_normal(x.shape), sigma, pose_id=poses.pose_id
     )
-    scanned = real_motion(machine, scan, p, disturbance=disturbance if scan_disturbed else None, rng=rng)
+    scanned = real_motion(machine, scan, p, )
     home = scanner.T_TW(0.0) @ T_HT
     return Experiment(
         machine=machine if believed is None else believed, poses=poses, observations=observations, scan=scan,
@@ -97,7 +101,7 @@ def experiment(
 
 def hexapod_experiment(
     machine: Any, kind: str, seed: int, *, size: float = 1.0, balls: int = 1, geometry: float = 1.0,
-    disturbance: Disturbance | None = None, scan_disturbed: bool = False,
+    disturbance: Disturbance | None = None, wide: bool = False,
 ) -> Experiment:
     """kind: "paper" or "mixed"; geometry: factor on the file's joints; size: factor on the joint errors."""
     rng = np.random.default_rng(np.random.SeedSequence([5, seed]))
@@ -105,7 +109,8 @@ def hexapod_experiment(
         np.array([0.0, 0.0, np.pi]) + 0.02 * rng.standard_normal(3), rng.uniform(-3, 3, 3), source=Frame.H,
         target=Frame.T,
     )
-    p = size * rng.standard_normal(len(machine.names)) * machine.sigma
+    exact = replace(machine, scale_sigma=0.0, geometry_sigma=0.0)  # the controller knows its own geometry
+    p = size * rng.standard_normal(len(exact.names)) * exact.sigma
     poses = paper_poses() if kind == "paper" else mixed_poses(rng, balls=balls)
     centres = np.array([[12.0, -14.0, 10.0], [-10.0, 12.0, -15.0]])[:balls]
     if kind == "paper":
@@ -114,27 +119,31 @@ def hexapod_experiment(
         machine, base_joints=geometry * machine.base_joints, platform_joints=geometry * machine.platform_joints
     )
     return experiment(
-        machine, p, poses, tilted_scan(T_HT), T_HT=T_HT, balls=centres, rng=rng, believed=believed,
-        disturbance=disturbance, scan_disturbed=scan_disturbed,
+        exact, p, poses, tilted_scan(T_HT, wide=wide), T_HT=T_HT, balls=centres, rng=rng, believed=believed,
+        disturbance=disturbance,
     )
 
 
-def robot_experiment(robot: Any, seed: int, *, n: int = 200, balls: int = 1) -> Experiment:
-    """The object on a robot's flange: n poses around the working one, then a tilted turn of 330 deg."""
+def robot_experiment(robot: Any, seed: int, *, n: int = 200, balls: int = 1, table: bool = False) -> Experiment:
+    """The object on a robot's flange: n poses around the working one, then a tilted turn of 330 deg.
+
+    table: the robot stands on the rotary table, which takes four angles.
+    """
     rng = np.random.default_rng(np.random.SeedSequence([6, seed]))
     p = rng.standard_normal(len(robot.names)) * robot.sigma
     centre = robot.forward(robot.q_start[None])
     # the working point lies at the W origin
     T_HT = RigidTransform.from_angles([0.01, -0.02, np.pi], np.zeros(3), source=Frame.H, target=Frame.T)
     T_HT = replace(T_HT, t=-(T_HT.R @ centre.t[0]))
-    t = np.array([[20.0, -15.0, 60.0], [-22.0, 10.0, 20.0], [5.0, 24.0, 40.0]])[:balls]
+    t = ROBOT_BALLS[:balls]
     q = robot.inverse(
         RigidTransform(
             R=centre.R[0] @ R_z(rng.uniform(-2.9, 2.9, n)) @ R_y(np.radians(rng.uniform(-20, 20, n))),
             t=centre.t[0] + rng.uniform(-12, 12, (n, 3)), source=Frame.M, target=Frame.H,
         )
     )
-    poses = poses_from_joints(robot, q, ball_id=np.arange(n) % balls)
+    alpha = np.radians(90.0 * (np.arange(n) * 4 // n)) if table else np.zeros(n)
+    poses = poses_from_joints(robot, q, ball_id=np.arange(n) % balls, alpha=alpha)
     angle = np.linspace(-2.9, 2.9, 180)
     q_scan = robot.inverse(
         RigidTransform(

@@ -19,6 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "2")
 
 import numpy as np
 from cases import (
+    ROBOT_BALLS,
     UM_PER_PX,
     Experiment,
     hexapod_experiment,
@@ -30,6 +31,7 @@ from tomopose.calibration.kinematic import calibrate_kinematic
 from tomopose.calibration.solve import calibrate
 from tomopose.manipulator.virtual import Disturbance, typical_hexapod, typical_robot
 
+DISTANCE = {(0, 1): (float(np.linalg.norm(np.subtract(*ROBOT_BALLS[:2]))), 0.0005)}
 HEXAPOD = typical_hexapod()
 ROBOT = typical_robot()
 WORN = Disturbance(
@@ -40,9 +42,11 @@ CASES: dict[str, Callable[[int], Experiment]] = {
     "paper's 189 poses": lambda s: hexapod_experiment(HEXAPOD, "paper", s),
     "189 mixed poses, 4 table angles": lambda s: hexapod_experiment(HEXAPOD, "mixed", s),
     "the same, geometry file 8 % wrong": lambda s: hexapod_experiment(HEXAPOD, "mixed", s, geometry=1.08),
+    "mixed poses, scan of 8 deg": lambda s: hexapod_experiment(HEXAPOD, "mixed", s, wide=True),
     "two ball positions": lambda s: hexapod_experiment(HEXAPOD, "mixed", s, balls=2),
     "6R robot, 200 poses, one ball": lambda s: robot_experiment(ROBOT, s),
-    "6R robot, 200 poses, three balls": lambda s: robot_experiment(ROBOT, s, balls=3),
+    "6R robot on the table, 4 angles": lambda s: robot_experiment(ROBOT, s, table=True),
+    "6R robot, two balls, known distance": lambda s: robot_experiment(ROBOT, s, balls=2),
     "mixed, backlash 3 um and drift": lambda s: hexapod_experiment(HEXAPOD, "mixed", s, disturbance=WORN),
     "paper's, backlash 3 um and drift": lambda s: hexapod_experiment(HEXAPOD, "paper", s, disturbance=WORN),
     "nothing wrong, paper's poses": lambda s: hexapod_experiment(HEXAPOD, "paper", s, size=0.0),
@@ -55,7 +59,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--cases", nargs="*", default=list(CASES))
     given = parser.parse_args()
-    print(f"{'case':36s} {'rigid':>9s} {'auto':>9s} {'worst':>8s} {'stated':>8s} {'um':>6s} {'inside':>7s} {'CPU s':>6s}  models")
+    print(
+        f"{'case':36s} {'rigid':>9s} {'auto':>9s} {'worst':>8s} {'stated':>8s} {'um':>6s} {'inside':>7s} {'CPU s':>6s}  models"
+    )
     for name in given.cases:
         rows, models = [], []
         for seed in range(given.seeds):
@@ -63,7 +69,8 @@ def main() -> None:
             rigid = calibrate(e.scanner, e.poses, e.observations, model="rigid", hypotheses=False)
             begin = time.process_time()
             found = calibrate_kinematic(
-                e.scanner, e.poses, e.observations, rigid=rigid, manipulator=e.machine, model="auto"
+                e.scanner, e.poses, e.observations, rigid=rigid, manipulator=e.machine, model="auto",
+                distances=DISTANCE if "known distance" in name else None,
             )
             cpu = time.process_time() - begin
             rows.append((trajectory_error(rigid, e)[0], *trajectory_error(found, e), cpu))

@@ -32,6 +32,7 @@ from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.error_models import manipulator_block
 from tomopose.manipulator.files import hexapod_from_document, read_manipulator, serial_from_document
 from tomopose.manipulator.hexapod import Hexapod
+from tomopose.manipulator.inverse import InverseManipulator
 from tomopose.manipulator.pose_map import PoseMap
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import ErrorModel, Repeatability
@@ -63,7 +64,7 @@ def calibrate_kinematic(
     Parameters
     ----------
     scanner, poses, observations: as in `calibrate`.
-    rigid:        the calibration that trusts the poses: the start, and the answer where "auto" finds no better.
+    rigid:        the calibration that trusts the poses: the start, and the answer if "auto" finds no better.
     manipulator:  Hexapod, SerialRobot, content or path of hexapod.json or robot.json; None for "slack".
     model:        "kinematic": the machine's errors; "slack": scatter and a smooth map of pose errors, for machines whose
                   kinematics nobody knows; "rigid": none; "auto": kinematic where evidence and held-out poses both say
@@ -117,7 +118,7 @@ def calibrate_kinematic(
 
 def machine_of(manipulator: Any) -> ErrorModel | None:
     """The error model meant by a model, a document or a path."""
-    if manipulator is None or isinstance(manipulator, (Hexapod, SerialRobot, PoseMap)):
+    if manipulator is None or isinstance(manipulator, (Hexapod, SerialRobot, PoseMap, InverseManipulator)):
         return manipulator
     if isinstance(manipulator, (str, Path)):
         return read_manipulator(manipulator)

@@ -77,7 +77,7 @@ def trajectory_jacobian(calibration: Calibration, poses: PoseSequence, points: A
     block = calibration.manipulator
     scale = float(block.get("translation_scale", 1.0))
     scale += sum(p.value - 1.0 for p in calibration.parameters if p.name == "translation_scale" and "kind" in block)
-    fixed = correction(block if "kind" in block else {}, poses)
+    fixed = correction(block, poses)
     T_MH = fixed.poses.T_MH
     x = np.asarray(points, dtype=np.float64)
     x_M = (scanner.T_TW(0.0).inv.apply(x) - calibration.T_HT.t) @ R_HT

@@ -82,8 +82,8 @@ def change_in_words(fit: ModelFit, change: RunChange) -> str:
         "mount": f"the manipulator moved by ({size}) mm on the table, or drifted",
     }
     return (
-        f"something changed during the run: from pose {pose!r} on {words[change.what]} (chi2 falls by {change.drop:.0f} "
-        "if that is allowed for)"
+        f"something changed during the run: from pose {pose!r} on {words[change.what]} (chi2 falls by "
+        f"{change.drop:.0f} if that is allowed for)"
     )
 
 

@@ -70,6 +70,6 @@ def determined_turns(estimate: MapEstimate) -> str:
     u = np.sqrt(after / len(problem.poses))
     return (
         f"{how_many} cannot determine the errors of the plate's turns: {100 * after / before:.0f} % of their prior "
-        f"variance is left, {1e6 * u:.0f} urad, which is {1000 * 30 * u:.1f} um at 30 mm from the ball; give the manipulator's "
-        "geometry (hexapod.json, robot.json) or image more balls far apart"
+        f"variance is left, {1e6 * u:.0f} urad, which is {1000 * 30 * u:.1f} um at 30 mm from the ball; give the "
+        "manipulator's geometry (hexapod.json, robot.json) or image more balls far apart"
     )

@@ -23,6 +23,7 @@ from tomopose.errors import InputError, OutOfReachError
 from tomopose.geometry.rotations import log_rotation
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.files import hexapod_from_document, serial_from_document
+from tomopose.manipulator.inverse import InverseManipulator
 from tomopose.manipulator.pose_map import PoseMap
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import ErrorModel, Repeatability, moved
@@ -74,22 +75,11 @@ def manipulator_block(model: ErrorModel, p: Array, u: Array, poses: PoseSequence
 
 def model_from_block(manipulator: Mapping[str, Any]) -> tuple[ErrorModel, Array]:
     """The machine and its errors p (m,) from a calibration's block; InputError where the block is damaged."""
-    kind, where = manipulator.get("kind"), "calibration: manipulator"
+    where = "calibration: manipulator"
     try:
-        nominal, values = manipulator["nominal"], np.array(manipulator["values"], dtype=np.float64)
-        model: ErrorModel
-        if kind == "hexapod":
-            model = hexapod_from_document(nominal, where)
-        elif kind == "serial":
-            model = serial_from_document(nominal, where)
-        elif kind == "map":
-            model = PoseMap(
-                order=int(nominal["order"]), t_scale=nominal["t_scale_mm"], w_scale=nominal["w_scale_rad"],
-                t_sigma=nominal["t_sigma_mm"], w_sigma=nominal["w_sigma_rad"],
-                repeatability=Repeatability(**nominal["repeatability"]),
-            )
-        else:
-            raise InputError(f"{where} has kind {kind!r}; hexapod, serial and map are known")
+        values = np.array(manipulator["values"], dtype=np.float64)
+        kind = manipulator["kind"]
+        model = _machine(kind, manipulator["nominal"], where)
     except KeyError as error:
         raise InputError(f"{where}: the key {error} is missing") from error
     if tuple(manipulator.get("names", ())) != model.names or values.shape != (len(model.names),):
@@ -97,13 +87,29 @@ def model_from_block(manipulator: Mapping[str, Any]) -> tuple[ErrorModel, Array]
     return model, values
 
 
+def _machine(kind: str, nominal: Mapping[str, Any], where: str) -> ErrorModel:
+    if kind == "hexapod":
+        return hexapod_from_document(nominal, where)
+    if kind == "serial":
+        return serial_from_document(nominal, where)
+    if kind == "inverse":
+        return InverseManipulator(machine=_machine(nominal["kind"], nominal["machine"], where))
+    if kind == "map":
+        return PoseMap(
+            order=int(nominal["order"]), t_scale=nominal["t_scale_mm"], w_scale=nominal["w_scale_rad"],
+            t_sigma=nominal["t_sigma_mm"], w_sigma=nominal["w_sigma_rad"],
+            repeatability=Repeatability(**nominal["repeatability"]),
+        )
+    raise InputError(f"{where} has kind {kind!r}; hexapod, serial, map and inverse are known")
+
+
 def correction(manipulator: Mapping[str, Any], poses: PoseSequence) -> Correction:
     """The table with the poses of the real plate, its Jacobian and what lies outside the calibrated range.
 
-    An empty block (a rigid calibration) leaves the poses as they are.
+    A block without a machine (a rigid calibration) leaves the poses as they are.
     """
     n = len(poses)
-    if not manipulator:
+    if "kind" not in manipulator:
         return Correction(poses=poses, J=np.zeros((n, 6, 0)), names=(), outside=np.zeros(n, dtype=bool))
     model, p = model_from_block(manipulator)
     real = model.real_poses(poses, p)
@@ -129,7 +135,7 @@ def commands_for(manipulator: Mapping[str, Any], wanted: PoseSequence) -> PoseSe
     Joint values are returned too where `wanted` has them (they say which branch of a robot is meant).
     Raises OutOfReachError, naming the poses, where the real machine cannot get there.
     """
-    if not manipulator:
+    if "kind" not in manipulator:
         return wanted
     model, p = model_from_block(manipulator)
     command = replace(wanted, q=None)

@@ -23,7 +23,7 @@ from tomopose.units import Array
 
 def typical_hexapod(
     *, base_radius: float = 160.0, platform_radius: float = 90.0, leg: float = 250.0, pivot_height: float = 200.0,
-    half_gap_deg: float = 12.0, joint_sigma: float = 0.1, leg_sigma: float = 0.1,
+    half_gap_deg: float = 5.0, joint_sigma: float = 0.1, leg_sigma: float = 0.1,
 ) -> Hexapod:
     """A hexapod of the size of the paper's: joints in three pairs, lengths in mm, the pivot above the platform.
 
