@@ -18,7 +18,7 @@ from collections.abc import Callable
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "2")
 
 import numpy as np
-from cases import (
+from manipulator_cases import (
     ROBOT_BALLS,
     UM_PER_PX,
     Experiment,
@@ -60,7 +60,8 @@ def main() -> None:
     parser.add_argument("--cases", nargs="*", default=list(CASES))
     given = parser.parse_args()
     print(
-        f"{'case':36s} {'rigid':>9s} {'auto':>9s} {'worst':>8s} {'stated':>8s} {'um':>6s} {'inside':>7s} {'CPU s':>6s}  models"
+        f"{'case':36s} {'rigid':>9s} {'auto':>9s} {'worst':>8s} {'stated':>8s} {'um':>6s} {'inside':>7s} {'CPU s':>6s}"
+        "  models"
     )
     for name in given.cases:
         rows, models = [], []

@@ -64,7 +64,7 @@ def calibrate_kinematic(
     Parameters
     ----------
     scanner, poses, observations: as in `calibrate`.
-    rigid:        the calibration that trusts the poses: the start, and the answer if "auto" finds no better.
+    rigid:        the calibration that trusts the poses: start, and the answer if "auto" finds no better.
     manipulator:  Hexapod, SerialRobot, content or path of hexapod.json or robot.json; None for "slack".
     model:        "kinematic": the machine's errors; "slack": scatter and a smooth map of pose errors, for machines whose
                   kinematics nobody knows; "rigid": none; "auto": kinematic where evidence and held-out poses both say

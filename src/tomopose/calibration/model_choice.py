@@ -33,13 +33,15 @@ class Judgement:
     """How one model did.
 
     log_evidence: at its optimum.  log_predictive: of the held-out centres.  cv_rms: rms distance, px, of the held-out
-    centres from their predictions.  d_rms: of the fit itself, px.
+    centres from their predictions.  cv_chi2: mean square of the held-out misses in predicted standard deviations, 1 where
+    the model holds all there is.  d_rms: of the fit itself, px.
     """
 
     model: str
     log_evidence: float
     log_predictive: float
     cv_rms: float
+    cv_chi2: float
     d_rms: float
     chi2_dof: float
     scatter: float
@@ -48,7 +50,7 @@ class Judgement:
     def to_json(self) -> dict[str, Any]:
         return {
             "model": self.model, "log_evidence": self.log_evidence, "log_predictive": self.log_predictive,
-            "cv_rms_px": self.cv_rms, "d_rms_px": self.d_rms, "chi2_dof": self.chi2_dof, "scatter": self.scatter,
+            "cv_rms_px": self.cv_rms, "cv_chi2": self.cv_chi2, "d_rms_px": self.d_rms, "chi2_dof": self.chi2_dof, "scatter": self.scatter,
             "size": self.size,
         }
 
@@ -73,13 +75,14 @@ def judge(name: str, fit: ModelFit) -> Judgement:
     r = (W @ estimate.at.r[:, :, None])[..., 0]
     A = W @ estimate.at.J
     information = np.linalg.inv(estimate.covariance)
-    log_predictive, squares, count = float(np.sum(np.log(np.einsum("nii->ni", W)))), 0.0, 0
+    log_predictive, squares, chi2, count = float(np.sum(np.log(np.einsum("nii->ni", W)))), 0.0, 0.0, 0
     for block in blocks_of(n, estimate.problem.data.ball):
         A_b, r_b = A[block].reshape(2 * len(block), -1), r[block].ravel()
         S_b = np.linalg.pinv(information - A_b.T @ A_b, hermitian=True, rcond=1e-14)
         V = np.eye(len(r_b)) + A_b @ S_b @ A_b.T
         missed = V @ r_b
         log_predictive -= 0.5 * float(r_b @ missed + np.linalg.slogdet(V)[1])
+        chi2 += float(r_b @ missed)
         d = np.linalg.solve(W[block], missed.reshape(-1, 2, 1))
         squares += float(np.sum(d**2))
         count += len(block)
@@ -88,6 +91,7 @@ def judge(name: str, fit: ModelFit) -> Judgement:
         log_evidence=estimate.log_evidence,
         log_predictive=log_predictive,
         cv_rms=float(np.sqrt(squares / max(count, 1))),
+        cv_chi2=chi2 / max(2 * count, 1),
         d_rms=float(np.sqrt(np.mean(np.sum(estimate.at.r**2, axis=1)))),
         chi2_dof=estimate.chi2 / max(estimate.dof, 1),
         scatter=fit.scatter,

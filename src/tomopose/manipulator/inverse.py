@@ -1,7 +1,7 @@
 r"""The other arrangement: the manipulator carries source and detector, the object stands still (C-arm, gantry).
 
-The chain of eq. (6) then runs through the *inverse* pose.  With H the manipulator's base, in which the ball stands, and M
-the moved plate, which carries the scanner,
+The chain of eq. (6) then runs through the *inverse* pose.  With H the manipulator's base, in which the ball stands, and
+M the moved plate, which carries the scanner,
 
     x_D = P_S T_WS T_MT T_MH^-1 (t; 1),     t the ball in H,  T_MT the mount of the scanner on the plate,
 

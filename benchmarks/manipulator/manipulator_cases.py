@@ -44,8 +44,8 @@ def mixed_poses(rng: np.random.Generator, *, n: int = 189, balls: int = 1) -> Po
 
 
 def tilted_scan(T_HT: RigidTransform, *, n: int = 180, wide: bool = False) -> PoseSequence:
-    """The paper's 3D scans, eq. (10): 1 deg + 4 deg sin 7 alpha; wide: the triangle wave of eq. (11), 8 deg, which leaves
-    the calibrated tilts of 5 deg."""
+    """The paper's 3D scans, eq. (10): 1 deg + 4 deg sin 7 alpha; wide: the triangle wave of eq. (11), 8 deg, beyond the
+    calibrated 5 deg."""
     alpha = np.arange(n) * 2 * np.pi / n
     tilt = np.radians(1 + 4 * np.sin(7 * alpha))
     if wide:
