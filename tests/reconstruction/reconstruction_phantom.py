@@ -129,17 +129,19 @@ class Truth:
     background: float
 
 
-def compare(values: np.ndarray, grid: VoxelGrid, objects: Balls, *, rays: int = 600) -> Truth:
-    """Fit spheres to the local 50 % surface along `rays` rays from each true centre."""
+def compare(values: np.ndarray, grid: VoxelGrid, objects: Balls, *, rays: int = 3000) -> Truth:
+    """Fit spheres to each ball's own 50 % surface, found along `rays` rays from its true centre.
+
+    The level lies midway between the mean value one voxel thick 3 to 4 voxels inside and outside the true surface.
+    """
     voxel = float(grid.spacing[0])
     n = directions(rays)
     centre_error, radius_error, inner = [], [], []
     for c, r, mu in zip(objects.centres, objects.radii, objects.mu, strict=True):
         t = np.arange(max(r - 4 * voxel, 0), r + 4 * voxel, voxel / 8)
         profile = trilinear(values, grid.indices(c + t[None, :, None] * n[:, None, :]))
-        inside, outside = profile[:, :8].mean(axis=1), profile[:, -8:].mean(axis=1)
-        level = 0.5 * (inside + outside)
-        below = profile < level[:, None]
+        level = 0.5 * (profile[:, :8].mean() + profile[:, -8:].mean())
+        below = profile < level
         first = np.maximum(below.argmax(axis=1), 1)
         row = np.arange(rays)
         high, low = profile[row, first - 1], profile[row, first]

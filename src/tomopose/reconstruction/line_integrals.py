@@ -136,10 +136,9 @@ class LineIntegrals:
             hint = ""
             if image.shape == expected[::-1]:
                 hint = "; rows and columns are exchanged: image[v, u] is needed"
-            elif image.ndim == 2 and image.shape[0]:
-                ratio = expected[0] / image.shape[0]
-                if ratio > 1 and ratio == int(ratio) and expected[1] // int(ratio) == image.shape[1]:
-                    hint = f"; the images look binned: use matrices.binned({int(ratio)})"
+            else:
+                factors = [f for f in range(2, 9) if image.shape == (expected[0] // f, expected[1] // f)]
+                hint = f"; the images look binned: use matrices.binned({factors[0]})" if factors else ""
             raise ShapeError(f"wrong size: image {j} is {image.shape}, the matrices are for {expected} (n_v, n_u){hint}")
         if image.dtype.kind not in "uif":
             raise InputError(f"image {j} holds {image.dtype}; real numbers are needed")
