@@ -23,6 +23,8 @@ def code_lines(text: str) -> list[str]:
         if line.startswith("```"):
             inside = not inside
             wanted = inside and line.strip("`").strip() in SHELLS
+        elif wanted and found and found[-1].endswith("\\"):
+            found[-1] = found[-1].removesuffix("\\") + line.strip()
         elif wanted:
             found.append(line)
     return found

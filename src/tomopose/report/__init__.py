@@ -1,15 +1,42 @@
-"""Reports: the only home of plotting and HTML.  Each function takes values and returns one offline HTML document."""
+"""Reports: the only home of plotting and HTML.  Each function takes values and returns one offline HTML document.
+
+Other results are reported with the same parts: a `Page` of `Section`s made of `Figure`, `Table`, `Words` and `Pictures`
+blocks, rendered by `render`.
+"""
 
 from tomopose.report.calibration_page import calibration_report
+from tomopose.report.history_page import comparison_report, history_report
 from tomopose.report.other_pages import matrices_report, observations_report
-from tomopose.report.page import write_report
+from tomopose.report.page import (
+    Figure,
+    KeyFigure,
+    Page,
+    Pictures,
+    Section,
+    Table,
+    Verdict,
+    Words,
+    render,
+    write_report,
+)
 from tomopose.report.thumbnails import Thumbnail, thumbnail, worst_thumbnails
 
 __all__ = [
+    "Figure",
+    "KeyFigure",
+    "Page",
+    "Pictures",
+    "Section",
+    "Table",
     "Thumbnail",
+    "Verdict",
+    "Words",
     "calibration_report",
+    "comparison_report",
+    "history_report",
     "matrices_report",
     "observations_report",
+    "render",
     "thumbnail",
     "worst_thumbnails",
     "write_report",

@@ -15,6 +15,7 @@ from tomopose.observations import BallObservations
 from tomopose.report import coverage_figures, residual_figures, scene_figures
 from tomopose.report.checks_section import checks_section
 from tomopose.report.gather import Joined, join
+from tomopose.report.history_page import history_section
 from tomopose.report.page import (
     BAD,
     CARE,
@@ -62,6 +63,7 @@ def calibration_report(
     poses: PoseSequence | None,
     thumbnails: Sequence[Thumbnail] = (),
     scan: ProjectionMatrices | None = None,
+    history: Sequence[Mapping[str, Any]] = (),
     title: str = "Calibration report",
 ) -> str:
     """One offline HTML document about a calibration.
@@ -73,13 +75,13 @@ def calibration_report(
     poses:        the pose table; without it the report knows no rotations, angles and scenes of poses.
     thumbnails:   pictures of the worst detections, worst first (`worst_thumbnails` makes them).
     scan:         matrices of a scan made with this calibration: adds the source's path and the expected effect.
+    history:      entries of the machine's history file, oldest first: adds control charts where there are three.
 
     Returns
     -------
     HTML text; it loads nothing from a network.  Parts that were not given are named as such.
     """
     joined = join(calibration, observations=observations, poses=poses)
-    checks = checks_section(calibration)
     n, left = len(calibration.pose_id), len(calibration.outliers)
     sections = [
         _parameters(calibration),
@@ -88,7 +90,7 @@ def calibration_report(
         _observability(calibration),
         _coverage(calibration, joined, observations),
         _scene(calibration, joined, scan),
-        *([checks] if checks is not None else []),
+        *(section for section in (checks_section(calibration), history_section(history)) if section is not None),
         provenance_section(calibration.provenance),
     ]
     page = Page(
