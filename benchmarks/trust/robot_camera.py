@@ -1,13 +1,13 @@
 """A real robot with a camera in hand: do mounts found from different corners agree within their stated uncertainty?
 
-Data: shared/data/robot-camera-kuka (Ali et al., Sensors 19 (2019) 2837): 28 images of a board of 408 corners.  One corner
-over the 28 poses is this package's problem: the corner is the ball, standing in the base M; H is the flange.
+Data: shared/data/robot-camera-kuka (Ali et al., Sensors 19 (2019) 2837): 28 images of a board of 408 corners.  One
+corner over the 28 poses is this package's problem: the corner is the ball, standing in the base M; H is the flange.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,9 @@ from tomopose.observations import BallObservations
 
 CORNER_SIGMA_PX = 0.1
 """The camera calibration's own residual (camera_calib_rms_px in the file)."""
+
+INTRINSIC_SIGMA_PX = 1.0
+"""How well focal length and piercing point of the camera are taken to be known; the file does not say."""
 
 D_SD_MM = 1000.0
 FIELD_LENGTH_MM = 200.0
@@ -111,13 +114,21 @@ def study(folder: Path, corners: Any = range(3, 408, 17)) -> dict[str, Any]:
     residual = [float(np.sqrt(((p.x_D - blocks(p, free, f).x_D) ** 2).sum(axis=1).mean()))
                 for p, f in zip(problems, fits, strict=True)]
     field = estimate_pose_field(problems, free, fits, length=FIELD_LENGTH_MM, base="M")
-    solved = [solve_with_field(p, free, f, field) for p, f in zip(problems, fits, strict=True)]
+    camera = problems[0].scanner
+    priors = {"d_SD": INTRINSIC_SIGMA_PX * camera.p_u, "u_0": INTRINSIC_SIGMA_PX, "v_0": INTRINSIC_SIGMA_PX}
+    modelled = {}
+    for name, freed in (("poses", free), ("poses and camera", free_parameters((camera,), priors=priors))):
+        solved = [
+            solve_with_field(p, freed, replace(f, delta=np.zeros(len(freed))), field)
+            for p, f in zip(problems, fits, strict=True)
+        ]
+        modelled[name] = normalised_spread([f for f, _ in solved], [C for _, C in solved])
     return {
         "corners": len(problems),
         "residual_px": float(np.median(residual)),
         "field": field,
         "plain": normalised_spread(fits, plain),
-        "modelled": normalised_spread([f for f, _ in solved], [C for _, C in solved]),
+        "modelled": modelled,
     }
 
 

@@ -140,6 +140,8 @@ def with_pose_noise(solution: Solution, pose_noise: Any, *, robust: bool = True)
     if pose_noise is None:
         return solution
     original = solution.problem
+    # what did not fit as a whole is not made to fit by setting its worst rows aside
+    robust = robust and not solution.robust.misfit
     if isinstance(pose_noise, str):
         if pose_noise != "auto":
             raise InputError(f"pose_noise is {pose_noise!r}; None, 'auto' or two numbers (mm, rad) are needed")

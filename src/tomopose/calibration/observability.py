@@ -142,7 +142,7 @@ def observability(problem: Problem, free: FreeParameters, J: Array, J_assumed: A
     whitened = (problem.W @ J).reshape(-1, J.shape[2])
     s, bad = unobservable_directions(whitened, names)
     pairs = [cure(problem, names, v) for v in bad]
-    notes = assumed_report(problem, (problem.W @ J_assumed).reshape(-1, len(assumed)), whitened, assumed)
+    notes = assumed_report(problem, (problem.W @ J_assumed).reshape(len(whitened), len(assumed)), whitened, assumed)
     return Observability(
         singular_values=s,
         unobservable=tuple(w for w, _ in pairs),
