@@ -104,7 +104,7 @@ def chart_figure(chart: ControlChart) -> Figure:
     """One number over the history with its limits.  mm and rad are shown as departure from the centre line."""
     factor, unit = SCALES.get(chart.unit, (1.0, chart.unit))
     base = 0.0 if chart.unit == "px" else chart.centre
-    x = [t[:16].replace("T", " ") for t in chart.time]
+    x = list(chart.time)
     y = factor * (chart.value - base)
     beyond = int(np.sum(chart.out))
     trend = f"trend by chance: {probability(chart.trend_p)}"
@@ -123,13 +123,14 @@ def chart_figure(chart: ControlChart) -> Figure:
     }
     if bars is not None:
         points["error_y"] = bars
+    words = meaning(chart.name).replace(", R = R_x R_y R_z", "") or "reprojection error"
     departure = "" if chart.unit == "px" else ", departure from the centre line"
     return Figure(
-        title=f"{meaning(chart.name).capitalize() or 'Reprojection error'}",
+        title=words[:1].upper() + words[1:],
         meaning=f"{chart.name}{departure}; dashed: limits of three standard deviations; {beyond} beyond; {trend}.",
         look_for="A red point or a trend means that something moved or wears.",
         data=[*lines, points],
-        layout=layout(xaxis=axis(type="category", nticks=8), yaxis=axis(f"{chart.name.removesuffix('_px')} / {unit}")),
+        layout=layout(xaxis=axis(type="date", nticks=6), yaxis=axis(f"{chart.name.removesuffix('_px')} / {unit}")),
         height=300,
         wide=False,
     )
