@@ -1,0 +1,67 @@
+"""Positive definite systems solved in one fixed order: the same bytes whatever the number of BLAS threads."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from tomopose.errors import BallNotFoundError
+from tomopose.units import Array
+
+RIDGE = 1e-12
+"""Added to the scaled diagonal: keeps a direction without data from stopping the solution."""
+
+
+def solve(N: Array, B: Array) -> Array:
+    """X (n, m) of N X = B, N (n, n) positive definite, B (n, m).  BallNotFoundError where N is not."""
+    good, X = _solve(N, B)
+    if not good:
+        raise BallNotFoundError("the rim does not determine a ball (singular normal equations)")
+    return np.asarray(X)
+
+
+@njit(cache=True)
+def _solve(N, B):  # type: ignore[no-untyped-def]
+    n, m = B.shape
+    scale = np.empty(n)
+    for i in range(n):
+        scale[i] = 1.0 / math.sqrt(N[i, i]) if N[i, i] > 0.0 else 0.0
+    L = np.zeros((n, n))
+    for i in range(n):
+        for j in range(i + 1):
+            total = N[i, j] * scale[i] * scale[j]
+            if i == j:
+                total = 1.0 + RIDGE if scale[i] > 0.0 else 1.0
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i == j:
+                if not total > 0.0:
+                    return False, B
+                L[i, i] = math.sqrt(total)
+            else:
+                L[i, j] = total / L[j, j]
+    X = np.empty((n, m))
+    for i in range(n):
+        for c in range(m):
+            X[i, c] = B[i, c] * scale[i]
+        for k in range(i):
+            f = L[i, k]
+            if f != 0.0:
+                for c in range(m):
+                    X[i, c] -= f * X[k, c]
+        for c in range(m):
+            X[i, c] /= L[i, i]
+    for i in range(n - 1, -1, -1):
+        for c in range(m):
+            X[i, c] /= L[i, i]
+        for k in range(i):
+            f = L[i, k]
+            if f != 0.0:
+                for c in range(m):
+                    X[k, c] -= f * X[i, c]
+    for i in range(n):
+        for c in range(m):
+            X[i, c] *= scale[i]
+    return True, X

@@ -1,0 +1,446 @@
+r"""Maximum-likelihood fit of a radiograph around the ball's rim (model: edges.py, profile.py, cone.py).
+
+Gauss-Newton on the shape (centre, radius, blur) and the linear background at once, which is variable projection: the
+Schur complement of the background's block is the projected normal matrix.  The background's curvature has a prior
+whose width is estimated sector by sector from the data themselves (empirical Bayes): none where the background is
+smooth, so that little information is given away, and a wide one where a holder's wall runs along the rim.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tomopose.detection.cholesky import solve
+from tomopose.detection.cone import cone_angle, cone_coordinates, ring_pixels
+from tomopose.detection.edges import FIRST_NODE, N_SHAPE, SHAPE, WHITE, influence, model_rows, normal_equations
+from tomopose.detection.noise import correlation, sandwich
+from tomopose.detection.profile import edge_profile
+from tomopose.errors import BallNotFoundError
+from tomopose.geometry.scanner import Scanner
+from tomopose.units import Array
+
+OUTLIER = 6.0
+"""Residual in standard deviations from which a single pixel counts as bad."""
+MISFIT = 6.0
+"""Standard deviations by which a sector's chi-square must exceed 1 for its background to count as badly fitted."""
+SMALLEST_BLUR, LARGEST_STEP = 0.25, 2.0
+STEEPEST = 6.0
+"""Prior: the background changes over the ring by no more than this many standard deviations of the ring's values."""
+KAPPA_STARTS = (0.4, 1.5, 4.0)
+"""Total attenuations along the diameter from which a ball that X-rays pass is fitted; below the first the shape of
+the profile no longer depends on it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConeFit:
+    """Result of one fit.
+
+    shape: (7,) in the order of edges.SHAPE; shape_covariance: (7, 7), NaN where a parameter was not fitted.
+    gamma: half-angle of the cone, rad.
+    level, white: mean background level and the ball's own; noise_out, noise_in: standard deviations there.
+    chi2_dof: with the noise of the background; rho: autocorrelation of the noise.
+    visible: share of the rim with pixels; lost: share of the visible rim's pixels left out as bad or outlying;
+    misfit: share of the rim where a holder's edge makes the background outside fit badly.
+    """
+
+    shape: Array
+    gamma: float
+    shape_covariance: Array
+    level: float
+    white: float
+    noise_out: float
+    noise_in: float
+    chi2_dof: float
+    rho: Array
+    visible: float
+    lost: float
+    misfit: float
+    anisotropy: Array
+    anisotropy_covariance: Array
+
+    @property
+    def snr(self) -> float:
+        """Contrast of the ball against its background over the background's noise."""
+        return abs(self.level - self.white) / self.noise_out
+
+
+class _Rim:
+    """Pixels of the ring, parameters, and the normal equations at the current parameters."""
+
+    def __init__(
+        self, window: Array, good: Array, origin: tuple[int, int], scanner: Scanner, x_D: Array, radius: float
+    ) -> None:
+        self.window, self.good, self.origin, self.scanner = window, good, origin, scanner
+        self.inverse_K = np.linalg.inv(scanner.K)
+        self.p = math.sqrt(scanner.p_u * scanner.p_v)
+        self.gamma_px = cone_angle(scanner, x_D, 1.0)
+        self.shape = np.array([x_D[0], x_D[1], radius, 0.8, np.inf, 0.0, 0.0])
+        self.n_nodes = int(np.clip(round(2 * math.pi * radius / 9.5), 6, 36))
+        self.nodes, self.white = np.zeros((self.n_nodes, 3)), 0.0
+        self.reach = float(np.clip(0.35 * radius, 5.0, 22.0))
+        self.outside = min(self.reach, 6.0)
+        self.inside = float(min(5.0, radius - 0.5))
+        box = np.array([scanner.p_u, scanner.p_v]) ** 2 / (12 * self.p**2)
+        self.box_u, self.box_v = box - box.mean()
+        self.precision = np.zeros(3 * self.n_nodes)
+        self.kappa_start, self.white_prior = 1.0, (0.0, 0.0)
+        self.gather()
+
+    def gather(self) -> None:
+        """Takes the pixels of the ring about the current silhouette."""
+        u_c, v_c, radius = self.shape[:3]
+        margin = 3.0 + 0.05 * radius
+        u, v, value = ring_pixels(
+            self.window, self.good, self.origin[0], self.origin[1], u_c, v_c, radius - self.inside - margin,
+            radius + self.outside + margin, self.scanner.p_u / self.p, self.scanner.p_v / self.p,
+        )  # fmt: skip
+        rim = self.coordinates(u, v)
+        keep = (rim[:, 0] > -self.inside) & (rim[:, 0] < self.outside)
+        self.u, self.v, self.value = u[keep], v[keep], value[keep]
+        if self.u.size < 4 * self.n_nodes:
+            raise BallNotFoundError(f"only {self.u.size} usable pixels round the rim at ({u_c:.1f}, {v_c:.1f})")
+        n = self.u.size
+        self.model, self.jacobian = np.zeros(n), np.zeros((n, 14))
+        self.left, self.share = np.zeros(n, np.int64), np.zeros(n)
+        self.weight = np.ones(n)
+        self.rim = np.ascontiguousarray(rim[keep])
+
+    def coordinates(self, u: Array, v: Array) -> Array:
+        s = self.shape
+        return np.asarray(
+            cone_coordinates(u, v, self.inverse_K, self.scanner.p_u, self.scanner.p_v, s[0], s[1], s[2] * self.gamma_px)
+        )
+
+    def evaluate(self) -> None:
+        s = self.shape
+        self.rim = self.coordinates(self.u, self.v)
+        table, first, step = edge_profile(s[3], s[4], s[2], -self.inside - 4.0, self.outside + 4.0)
+        model_rows(
+            self.rim, self.nodes, self.white, table, first, step, s[3], self.gamma_px, self.box_u, self.box_v, s[5],
+            s[6], self.model, self.jacobian, self.left, self.share,
+        )  # fmt: skip
+
+    @property
+    def residual(self) -> Array:
+        return self.value - self.model
+
+    def normal(self, active: npt.NDArray[np.intp]) -> tuple[Array, Array]:
+        """Normal matrix and right side of the active parameters, priors included."""
+        N, g = normal_equations(self.value, self.model, self.jacobian, self.left, self.weight, self.n_nodes)
+        if math.isfinite(self.shape[4]):
+            N[4, 4] += 1.0 / self.kappa_start**2
+            g[4] -= (self.shape[4] - self.kappa_start) / self.kappa_start**2
+        N[WHITE, WHITE] += self.white_prior[1]
+        g[WHITE] -= self.white_prior[1] * (self.white - self.white_prior[0])
+        i = np.arange(FIRST_NODE, FIRST_NODE + 3 * self.n_nodes)
+        centre = np.zeros_like(self.nodes)
+        centre[:, 0] = np.mean(self.nodes[:, 0])
+        N[i, i] += self.precision
+        g[i] -= self.precision * (self.nodes - centre).ravel()
+        return N[np.ix_(active, active)], g[active]
+
+    def step(self, active: npt.NDArray[np.intp]) -> float:
+        """One Gauss-Newton step; returns the largest move of centre and radius, px."""
+        N, g = self.normal(active)
+        delta = solve(N, g[:, None])[:, 0]
+        full = np.zeros(FIRST_NODE + 3 * self.n_nodes)
+        full[active] = delta
+        largest = float(np.abs(full[:3]).max())
+        if largest > LARGEST_STEP:
+            full[:N_SHAPE] *= LARGEST_STEP / largest
+        if not np.isfinite(full).all():
+            raise BallNotFoundError("the rim does not determine a ball (no finite step)")
+        s = self.shape.copy()
+        s[active[active < N_SHAPE]] += full[active[active < N_SHAPE]]
+        s[3] = np.clip(s[3], max(SMALLEST_BLUR, self.shape[3] / 2), min(self.shape[3] * 2, 0.45 * s[2]))
+        if math.isfinite(s[4]):
+            s[4] = np.clip(s[4], max(self.shape[4] / 2, 0.1), min(self.shape[4] * 2, 20.0))
+        self.shape = s
+        self.white += full[WHITE]
+        self.nodes = self.nodes + full[FIRST_NODE:].reshape(-1, 3)
+        self.evaluate()
+        return largest
+
+    def active(self, *shape: str, curvature: bool = True) -> npt.NDArray[np.intp]:
+        use = np.zeros(FIRST_NODE + 3 * self.n_nodes, dtype=bool)
+        use[[SHAPE.index(name) for name in shape]] = True
+        use[WHITE:] = True
+        if not curvature:
+            use[FIRST_NODE + 2 :: 3] = False
+        return np.flatnonzero(use)
+
+    @property
+    def level(self) -> float:
+        return float(np.mean(self.nodes[:, 0]))
+
+
+def fit_cone(
+    window: Array,
+    good: Array,
+    origin: tuple[int, int],
+    scanner: Scanner,
+    x_D: Array,
+    radius: float,
+    quantum: float = 0.0,
+) -> ConeFit:
+    """Fits the ball whose rim lies within 2 px or so of a circle.
+
+    Parameters
+    ----------
+    window:  float64 [v, u], the part of the radiograph that holds the ball and its surroundings.
+    good:    bool, same shape: pixels that may be used.
+    origin:  D coordinates (u, v) of window[0, 0].
+    x_D, radius:  where the rim about is, px.
+    quantum: step of the image's values (1 for counts, 0 for floats): no noise is smaller than quantum / sqrt(12).
+
+    Raises
+    ------
+    BallNotFoundError  where no ball can be fitted there.
+    """
+    rim = _Rim(window, good, origin, scanner, np.asarray(x_D, dtype=np.float64), radius)
+    spread = float(np.std(rim.value))
+    if not spread > 0:
+        raise BallNotFoundError(f"the image is constant around ({x_D[0]:.1f}, {x_D[1]:.1f})")
+    floor = quantum**2 / 12 + (1e-5 * spread) ** 2
+    _approach(rim, spread)
+    kappa_free = _is_transparent(rim)
+    shape: tuple[str, ...] = ("u", "v", "radius", "sigma")
+    if kappa_free:
+        _choose_kappa(rim, spread)
+        shape = (*shape, "kappa")
+    rim.outside = rim.reach
+    rim.gather()
+    rim.weight = np.full(rim.u.size, 1.0 / (0.03 * spread) ** 2)
+    rim.evaluate()
+    rim.step(rim.active(curvature=False))
+    active = rim.active(*shape)
+    for turn in range(3):
+        v_low, v_high, excess = _weigh(rim, floor, 2.0 if turn == 0 else 2.5)
+        widest = (rim.reach**2 / (STEEPEST * spread)) ** 2
+        rim.precision[2::3] = widest if turn < 1 else np.maximum(_curvature_precision(rim, active), widest)
+        for _ in range(1 if turn < 2 else 4):
+            if rim.step(active) < 1e-4:
+                break
+    anisotropy, anisotropy_covariance = _anisotropy(rim, shape)
+    significance = float(anisotropy @ np.linalg.solve(anisotropy_covariance, anisotropy))
+    if significance > 30.0 and np.hypot(*anisotropy) > 0.1 * rim.shape[3] ** 2:
+        shape = (*shape, "q_cos", "q_sin")
+        active = rim.active(*shape)
+        for _ in range(3):
+            rim.step(active)
+        anisotropy = rim.shape[5:7].copy()
+    return _result(rim, shape, active, (v_low, v_high), excess, anisotropy, anisotropy_covariance)
+
+
+def _approach(rim: _Rim, spread: float) -> None:
+    """From the finder's circle to the neighbourhood of the optimum, without curvature and with equal weights."""
+    rim.weight = np.full(rim.u.size, 1.0 / (0.03 * spread) ** 2)
+    prior = np.zeros((rim.n_nodes, 3))
+    prior[:, 0], prior[:, 1] = 1 / (STEEPEST * spread) ** 2, (rim.reach / (STEEPEST * spread)) ** 2
+    rim.precision = prior.ravel()
+    rim.white_prior = (float(np.mean(rim.value)), 1 / (STEEPEST * spread) ** 2)
+    rim.evaluate()
+    rim.step(rim.active(curvature=False))
+    for turn in range(14):
+        moved = rim.step(rim.active("u", "v", "radius", *(("sigma",) if turn else ()), curvature=False))
+        if moved < 0.02 and turn > 1:
+            break
+        if turn in (1, 3, 6, 9) and moved > 0.02:
+            rim.gather()
+            rim.evaluate()
+        away = np.abs(rim.rim[:, 0]) > 3.0 + 2 * moved
+        scale = 1.4826 * float(np.median(np.abs(rim.residual[away]))) if away.any() else 0.0
+        out = away & (np.abs(rim.residual) > max(8 * scale, 0.1 * spread))
+        rim.weight = np.where(out, 0.0, 1.0 / (0.03 * spread) ** 2)
+
+
+def _is_transparent(rim: _Rim) -> bool:
+    """Whether the ball grows darker towards its middle by more than noise and 1 % of its contrast."""
+    depth = 3 * rim.shape[3] + 0.5
+    radius = rim.shape[2]
+    if radius - depth < 2.0:
+        return True
+    rings = ((radius - depth - 0.08 * radius - 1.0, radius - depth), (0.0, max(0.6 * (radius - depth), 1.5)))
+    middle = []
+    for low, high in rings:
+        *_, value = ring_pixels(
+            rim.window, rim.good, rim.origin[0], rim.origin[1], rim.shape[0], rim.shape[1], low, high,
+            rim.scanner.p_u / rim.p, rim.scanner.p_v / rim.p,
+        )  # fmt: skip
+        if value.size < 5:
+            return False
+        m = float(np.median(value))
+        middle.append((m, 1.8 * float(np.median(np.abs(value - m))) / math.sqrt(value.size)))
+    (near, u_near), (deep, u_deep) = middle
+    return abs(near - deep) > max(0.01 * abs(rim.level - deep), 6 * math.hypot(u_near, u_deep))
+
+
+def _choose_kappa(rim: _Rim, spread: float) -> None:
+    """Widens the ring inwards and takes the best of several starts for the total attenuation."""
+    radius = rim.shape[2]
+    rim.inside = float(min(max(0.35 * radius, 3 * rim.shape[3] + 2.0), 14.0, radius - 0.5))
+    rim.gather()
+    rim.weight = np.full(rim.u.size, 1.0 / (0.03 * spread) ** 2)
+    start = (rim.shape.copy(), rim.nodes.copy(), rim.white)
+    best = None
+    for kappa in KAPPA_STARTS:
+        rim.shape, rim.nodes, rim.white = start[0].copy(), start[1].copy(), start[2]
+        rim.shape[4] = rim.kappa_start = kappa
+        rim.evaluate()
+        rim.step(rim.active(curvature=False))
+        for _ in range(4):
+            rim.step(rim.active("u", "v", "radius", "sigma", "kappa", curvature=False))
+        cost = float((rim.weight * rim.residual**2).sum())
+        if best is None or cost < best[0]:
+            best = (cost, rim.shape, rim.nodes, rim.white, kappa)
+    assert best is not None
+    _, rim.shape, rim.nodes, rim.white, rim.kappa_start = best
+    rim.evaluate()
+
+
+def _weigh(rim: _Rim, floor: float, parameters: float) -> tuple[float, float, Array]:
+    """Noise at the ball's and the background's level, single outliers dropped, how badly sectors fit.
+
+    The noise is the median over the sectors round the rim, so that a holder's edge that no smooth background follows
+    does not count as noise; parameters: linear parameters that a sector's pixels determine.  The last result
+    is each sector's chi-square less 1, in standard deviations.
+    """
+    s, sigma, k = rim.rim[:, 0], rim.shape[3], rim.n_nodes
+    square = rim.residual**2
+    x = np.clip((rim.model - rim.white) / (rim.level - rim.white), 0.0, 1.3)
+    outside, inside = s > 3 * sigma, s < -3 * sigma
+    limit = OUTLIER**2 * (_sector_median(square[outside], rim.left[outside], k)[rim.left] / 0.455 + floor)
+    rim_zone = ~(outside | inside)
+    if rim_zone.any():
+        limit[rim_zone] = np.maximum(limit[rim_zone], OUTLIER**2 * np.median(square[rim_zone]) / 0.455)
+    used = square < np.where(s > -3 * sigma, limit, np.maximum(limit, OUTLIER**2 * floor))
+    n_k = np.bincount(rim.left, weights=used & outside, minlength=k)
+    enough = n_k > 2 * parameters + 2
+    if not enough.any():
+        raise BallNotFoundError("too few usable pixels outside the rim to measure the noise")
+    mean = np.bincount(rim.left, weights=square * (used & outside), minlength=k) / np.maximum(n_k - parameters, 1)
+    v_out = max(float(np.median(mean[enough])), floor)
+    core = inside & used if (inside & used).sum() > 20 else used & (s < 0)
+    v_in, x_in = (float(square[core].mean()), float(x[core].mean())) if core.any() else (v_out, 1.0)
+    slope = (v_out - v_in) / max(1.0 - x_in, 0.05)
+    v_low, v_high = max(v_out - slope, 1e-4 * v_out, floor), v_out
+    expected = np.maximum(v_low + (v_high - v_low) * x, floor)
+    chi2 = np.bincount(rim.left, weights=square * (used & outside) / expected, minlength=k) / np.maximum(n_k, 1)
+    rim.weight = np.where(used, 1.0 / expected, 0.0)
+    return v_low, v_high, (chi2 - 1.0) / np.sqrt(2.0 / np.maximum(n_k, 1))
+
+
+def _sector_median(values: Array, sector: Array, k: int) -> Array:
+    """Median of the values in each of k sectors; of all values where a sector has none."""
+    out = np.full(k, float(np.median(values)) if values.size else 0.0)
+    order = np.argsort(sector, kind="stable")
+    edges = np.searchsorted(sector[order], np.arange(k + 1))
+    for n in range(k):
+        if edges[n + 1] > edges[n]:
+            out[n] = np.median(values[order[edges[n] : edges[n + 1]]])
+    return out
+
+
+def _curvature_precision(rim: _Rim, active: npt.NDArray[np.intp]) -> Array:
+    """Empirical Bayes: 1 / tau_k^2 with tau_k^2 what the estimated curvature shows above its own variance."""
+    kept, rim.precision = rim.precision, rim.precision.copy()
+    rim.precision[2::3] = 0.0
+    N, _ = rim.normal(active)
+    rim.precision = kept
+    at = np.searchsorted(active, np.arange(FIRST_NODE + 2, FIRST_NODE + 3 * rim.n_nodes, 3))
+    unit = np.zeros((active.size, at.size))
+    unit[at, np.arange(at.size)] = 1.0
+    V = solve(N, unit)[at, np.arange(at.size)]
+    excess = rim.nodes[:, 2] ** 2 - V
+    smooth = (np.roll(excess, 1) + 2 * excess + np.roll(excess, -1)) / 4
+    return np.asarray(1.0 / np.maximum(smooth, 1e-3 * V))
+
+
+def _anisotropy(rim: _Rim, shape: tuple[str, ...]) -> tuple[Array, Array]:
+    """One Gauss-Newton step towards a blur that depends on direction, and its covariance, px^2."""
+    active = rim.active(*shape, "q_cos", "q_sin")
+    N, g = rim.normal(active)
+    at = np.searchsorted(active, [SHAPE.index(q) for q in ("q_cos", "q_sin")])
+    right = np.zeros((active.size, 3))
+    right[at, [0, 1]] = 1.0
+    right[:, 2] = g
+    X = solve(N, right)[at]
+    return X[:, 2].copy(), X[:, :2].copy()
+
+
+def _result(
+    rim: _Rim,
+    shape: tuple[str, ...],
+    active: npt.NDArray[np.intp],
+    variances: tuple[float, float],
+    excess: Array,
+    anisotropy: Array,
+    anisotropy_covariance: Array,
+) -> ConeFit:
+    N, _ = rim.normal(active)
+    m = len(shape)
+    rows = solve(N, np.eye(active.size, m)).T
+    at = [SHAPE.index(name) for name in shape]
+    block = (rows[:, :m] + rows[:, :m].T) / 2
+    s, sigma = rim.rim[:, 0], rim.shape[3]
+    clean = (rim.weight > 0) & (excess < MISFIT)[rim.left]
+    outside = (s > 3 * sigma) & (rim.weight > 0) & (excess <= np.median(excess))[rim.left]
+    normalised = rim.residual * np.sqrt(rim.weight)
+    rho = correlation(
+        rim.u[outside], rim.v[outside], normalised[outside], max(outside.sum() / (1.5 * rim.n_nodes), 3.0)
+    ) if outside.sum() > 200 else np.ones((1, 1))
+    if np.count_nonzero(rho) > 1:
+        effect = influence(rim.jacobian, rim.left, rim.weight, _scattered(rim, active, rows), rim.n_nodes)
+        block = sandwich(rim.u, rim.v, effect, rho)
+    near = (np.abs(s) <= 3 * sigma) & clean
+    n_near = max(int(near.sum()), 1)
+    chi2_near = float((normalised[near] ** 2).mean()) if near.any() else 1.0
+    if chi2_near > 1.0 + 5.0 * math.sqrt(2.0 / n_near):
+        block = block * chi2_near
+    covariance = np.full((N_SHAPE, N_SHAPE), np.nan)
+    covariance[np.ix_(at, at)] = block
+    weighted = rim.weight > 0
+    visible, lost = _rim_shares(rim)
+    return ConeFit(
+        shape=rim.shape,
+        gamma=float(rim.shape[2] * rim.gamma_px),
+        shape_covariance=covariance,
+        level=rim.level,
+        white=float(rim.white),
+        noise_in=math.sqrt(variances[0]),
+        noise_out=math.sqrt(variances[1]),
+        chi2_dof=float((normalised[weighted] ** 2).sum() / max(int(weighted.sum()) - len(active), 1)),
+        rho=rho,
+        visible=visible,
+        lost=lost,
+        misfit=float((excess >= MISFIT).mean()),
+        anisotropy=anisotropy,
+        anisotropy_covariance=anisotropy_covariance,
+    )
+
+
+def _scattered(rim: _Rim, active: npt.NDArray[np.intp], rows: Array) -> Array:
+    """Rows of the inverse normal matrix (m, active) in the order of all parameters, zero where one was not fitted."""
+    full = np.zeros((rows.shape[0], FIRST_NODE + 3 * rim.n_nodes))
+    full[:, active] = rows
+    return full
+
+
+def _rim_shares(rim: _Rim) -> tuple[float, float]:
+    """Share of the rim's directions with a pixel in the image, and share of the rim's pixels that were left out."""
+    radius, half = rim.shape[2], max(1.5, 2 * rim.shape[3])
+    u, v, _ = ring_pixels(
+        rim.window, np.ones_like(rim.good), rim.origin[0], rim.origin[1], rim.shape[0], rim.shape[1], radius - half - 1,
+        radius * 1.1 + half + 1, rim.scanner.p_u / rim.p, rim.scanner.p_v / rim.p,
+    )  # fmt: skip
+    every = rim.coordinates(u, v)
+    every = every[np.abs(every[:, 0]) < half]
+    bins = int(np.clip(2 * radius, 16, 180))
+    angle = np.arctan2(every[:, 5], every[:, 4])
+    seen = np.unique(np.floor((angle / (2 * math.pi) + 0.5) * bins * (1 - 1e-12)))
+    kept = (np.abs(rim.rim[:, 0]) < half) & (rim.weight > 0)
+    return seen.size / bins, 1.0 - float(kept.sum()) / max(len(every), 1)
