@@ -2,7 +2,8 @@
 
 Rays go through the pixels' corners.  Where a pixel and its neighbours see the same surfaces and the transmission is
 smooth, its mean follows from the corners (bilinear with the curvature's correction).  Everywhere else the pixel is cut in
-f x f cells, and a cell with an edge is sampled at the points of a Fibonacci lattice, which no straight edge can follow.
+f x f cells; a cell with a faint edge is sampled at the points of a Fibonacci lattice, which no straight edge can follow, and
+a cell with a steep edge is cut along it.
 The result has f x f cells a pixel, so that blur acts before the pixel integrates, as it does in a scintillator; and each
 cell holds four numbers (mean, slope along u, slope along v, twist: the bilinear surface nearest to the transmission), so
 that an edge keeps its place inside its cell.
@@ -26,10 +27,13 @@ from tomopose.simulation.rays import LARGEST, Compiled, trace
 from tomopose.simulation.spectrum import Beam
 from tomopose.units import Array
 
-LATTICES = ((5, 3), (13, 8), (34, 21), (89, 55))
-"""Fibonacci lattices (n, k) of a cell: points (i / n, k i / n mod 1)."""
+LATTICES = ((5, 3), (13, 8), (21, 13))
+"""Fibonacci lattices (n, k) of a cell: points (i / n, k i / n mod 1), placed symmetrically about its middle."""
 FLAT = 2e-3
-"""Differences of transmission over a cell below this need no lattice; above 4, 16, 64 times as much the finer ones."""
+"""Differences of transmission over a cell below this need no lattice; above 4, 16 times as much a finer one; above 32 times
+an edge is cut exactly."""
+LINES, HALVINGS = 6, 9
+GAUSS = np.stack([(np.polynomial.legendre.leggauss(4)[0] + 1) / 2, np.polynomial.legendre.leggauss(4)[1] / 2], axis=1)
 OPAQUE = 30.0
 """exp(-30) = 1e-13: nothing gets through."""
 STEPS = 128
@@ -157,11 +161,44 @@ def _add(out: Any, row: int, column: int, m: float, m_u: float, m_v: float, m_uv
 
 
 @njit(cache=True, nogil=True)
-def _cells(c: Any, depth: int, u_0: int, v_0: int, I: Any, seen: Any, f: int, j_0: int, j_1: int, weight: float, out: Any,
-           ) -> None:
-    """Add weight x moments of the f x f cells of the pixels in rows j_0 to j_1 to `out` (4, rows, columns)."""
-    work = _work_space(c, depth)
-    node, node_seen = np.empty((f + 1, f + 1)), np.empty((f + 1, f + 1), dtype=np.int64)
+def _split_cell(c: Any, work: Any, left: float, low: float, h: float, along_u: bool) -> Any:
+    """Moments (m, m_u, m_v, m_uv about the middle, side 1) of a cell that a steep edge crosses.
+
+    On each of LINES lines across the edge its place is found by halving, and both sides are integrated by Gauss's rule in
+    the root of the distance from the edge, where the transmission behind a round rim is smooth.
+    """
+    m = m_u = m_v = m_uv = 0.0
+    for q in range(LINES):
+        y = (q + 0.5) / LINES
+        lo, hi = 0.0, 1.0
+        _, mark_lo = _at(c, work, left + (0.0 if along_u else y) * h, low + (y if along_u else 0.0) * h)
+        _, mark_hi = _at(c, work, left + (1.0 if along_u else y) * h, low + (y if along_u else 1.0) * h)
+        if mark_lo != mark_hi:
+            for _ in range(HALVINGS):
+                x = 0.5 * (lo + hi)
+                _, mark = _at(c, work, left + (x if along_u else y) * h, low + (y if along_u else x) * h)
+                if mark == mark_lo:
+                    lo = x
+                else:
+                    hi = x
+        edge = 0.5 * (lo + hi)
+        for side in range(2):
+            length = -edge if side == 0 else 1.0 - edge
+            for g in range(len(GAUSS)):
+                x = edge + length * GAUSS[g, 0] ** 2
+                value, _ = _at(c, work, left + (x if along_u else y) * h, low + (y if along_u else x) * h)
+                value *= 2 * GAUSS[g, 0] * GAUSS[g, 1] * abs(length) / LINES
+                a, b = (x - 0.5, y - 0.5) if along_u else (y - 0.5, x - 0.5)
+                m += value
+                m_u += value * a
+                m_v += value * b
+                m_uv += value * a * b
+    return m, m_u, m_v, m_uv
+
+
+@njit(cache=True, nogil=True)
+def fill_smooth(I: Any, seen: Any, f: int, j_0: int, j_1: int, weight: float, out: Any, rough: Any) -> None:
+    """Add weight x moments of the cells of smooth pixels in rows j_0 to j_1 to `out`; mark the others in `rough`."""
     h = 1.0 / f
     # Mean over cell b of x (1 - x) / 2: what bilinear interpolation between the corners misses per unit of curvature.
     bow = np.empty(f)
@@ -170,24 +207,39 @@ def _cells(c: Any, depth: int, u_0: int, v_0: int, I: Any, seen: Any, f: int, j_
         bow[b] = ((hi**2 - lo**2) / 4 - (hi**3 - lo**3) / 6) / h
     for j in range(j_0, j_1):
         for i in range(I.shape[1] - 1):
-            if _smooth(I, seen, j, i):
-                if seen[j, i] == 0:
-                    for a in range(f):
-                        for b in range(f):
-                            out[0, j * f + a, i * f + b] += weight
-                    continue
-                f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
-                I_uu = 0.5 * (I[j, i - 1] - f_00 - f_01 + I[j, i + 2] + I[j + 1, i - 1] - f_10 - f_11 + I[j + 1, i + 2]) / 2
-                I_vv = 0.5 * (I[j - 1, i] - f_00 - f_10 + I[j + 2, i] + I[j - 1, i + 1] - f_01 - f_11 + I[j + 2, i + 1]) / 2
-                twist = f_11 - f_10 - f_01 + f_00
+            rough[j, i] = not _smooth(I, seen, j, i)
+            if rough[j, i]:
+                continue
+            if seen[j, i] == 0:
                 for a in range(f):
-                    y = (a + 0.5) * h
                     for b in range(f):
-                        x = (b + 0.5) * h
-                        I_u, I_v = f_01 - f_00 + y * twist, f_10 - f_00 + x * twist
-                        value = f_00 + x * (f_01 - f_00) + y * I_v - bow[b] * I_uu - bow[a] * I_vv
-                        _add(out, j * f + a, i * f + b, weight * value, weight * (I_u + (x - 0.5) * I_uu),
-                             weight * (I_v + (y - 0.5) * I_vv), weight * twist)
+                        out[0, j * f + a, i * f + b] += weight
+                continue
+            f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
+            I_uu = 0.25 * (I[j, i - 1] - f_00 - f_01 + I[j, i + 2] + I[j + 1, i - 1] - f_10 - f_11 + I[j + 1, i + 2])
+            I_vv = 0.25 * (I[j - 1, i] - f_00 - f_10 + I[j + 2, i] + I[j - 1, i + 1] - f_01 - f_11 + I[j + 2, i + 1])
+            twist = f_11 - f_10 - f_01 + f_00
+            for a in range(f):
+                y = (a + 0.5) * h
+                for b in range(f):
+                    x = (b + 0.5) * h
+                    I_u, I_v = f_01 - f_00 + y * twist, f_10 - f_00 + x * twist
+                    value = f_00 + x * (f_01 - f_00) + y * I_v - bow[b] * I_uu - bow[a] * I_vv
+                    _add(out, j * f + a, i * f + b, weight * value, weight * (I_u + (x - 0.5) * I_uu),
+                         weight * (I_v + (y - 0.5) * I_vv), weight * twist)
+
+
+@njit(cache=True, nogil=True)
+def _cells(c: Any, depth: int, u_0: int, v_0: int, I: Any, seen: Any, f: int, j_0: int, j_1: int, weight: float, out: Any,
+           rough: Any) -> None:
+    """Add weight x moments of the f x f cells of the pixels in rows j_0 to j_1 to `out` (4, rows, columns)."""
+    work = _work_space(c, depth)
+    node, node_seen = np.empty((f + 1, f + 1)), np.empty((f + 1, f + 1), dtype=np.int64)
+    h = 1.0 / f
+    fill_smooth(I, seen, f, j_0, j_1, weight, out, rough)
+    for j in range(j_0, j_1):
+        for i in range(I.shape[1] - 1):
+            if not rough[j, i]:
                 continue
             left, low = u_0 + i - 0.5, v_0 + j - 0.5
             for a in range(f + 1):
@@ -212,13 +264,17 @@ def _cells(c: Any, depth: int, u_0: int, v_0: int, I: Any, seen: Any, f: int, j_
                              weight * f * (f_01 + f_11 - f_00 - f_10) / 2, weight * f * (f_10 + f_11 - f_00 - f_01) / 2,
                              weight * f * f * (f_11 - f_10 - f_01 + f_00))
                         continue
-                    which = 1 if span > 4 * FLAT else 0
-                    if span > 16 * FLAT:
-                        which = 2 if same or span < 64 * FLAT else 3
+                    if not same and span > 32 * FLAT:
+                        across = abs(f_01 + f_11 - f_00 - f_10) > abs(f_10 + f_11 - f_00 - f_01)
+                        m, m_u, m_v, m_uv = _split_cell(c, work, left + b * h, low + a * h, h, across)
+                        k = weight * 12 * f
+                        _add(out, j * f + a, i * f + b, weight * m, k * m_u, k * m_v, k * 12 * f * m_uv)
+                        continue
+                    which = 2 if span > 16 * FLAT else (1 if span > 4 * FLAT else 0)
                     n, step = LATTICES[which]
                     m = m_u = m_v = m_uv = 0.0
                     for q in range(n):
-                        x, y = (q + 0.5) / n, ((q * step) % n + 0.5) / n
+                        x, y = (q + 0.5) / n, (((q - n // 2) * step + n // 2) % n + 0.5) / n
                         value, _ = _at(c, work, left + (b + x) * h, low + (a + y) * h)
                         m += value
                         m_u += value * (x - 0.5)
@@ -239,9 +295,10 @@ class Window:
     n_v: int
 
 
-def shadow(compiled: Compiled, view: View, T_FW: dict[Frame, RigidTransform], scanner: Scanner, margin: int) -> Window | None:
-    """The pixels that the solids can shade, with a margin, cut `margin` outside the detector; None where there are none."""
-    boxes = shadow_boxes(compiled, view, T_FW)
+def shadow(outlines: list[tuple[Frame, Array]], view: View, T_FW: dict[Frame, RigidTransform], scanner: Scanner, margin: int,
+           ) -> Window | None:
+    """The pixels that convex hulls of points (k, 3) in their frames can shade, with a margin, cut `margin` outside the detector; None where there are none."""
+    boxes = shadow_boxes(outlines, view, T_FW)
     lo, hi = np.floor(boxes[:, 0].min(axis=0)) - margin, np.ceil(boxes[:, 1].max(axis=0)) + margin
     u_0, v_0 = max(int(lo[0]), -margin), max(int(lo[1]), -margin)
     u_1, v_1 = min(int(hi[0]) + 1, scanner.n_u + margin), min(int(hi[1]) + 1, scanner.n_v + margin)
@@ -249,10 +306,20 @@ def shadow(compiled: Compiled, view: View, T_FW: dict[Frame, RigidTransform], sc
     return Window(u_0=u_0, v_0=v_0, n_u=u_1 - u_0, n_v=v_1 - v_0) if seen else None
 
 
-def shadow_boxes(compiled: Compiled, view: View, T_FW: dict[Frame, RigidTransform]) -> Array:
-    """(m, 2, 2): lowest and highest (u, v) of each solid's outline."""
-    boxes = np.empty((len(compiled.frame), 2, 2))
-    for k, (frame, corners) in enumerate(zip(compiled.frame, compiled.corners, strict=True)):
+def enclosing(windows: list[Window | None]) -> Window | None:
+    """The smallest window that holds them all."""
+    some = [w for w in windows if w is not None]
+    if not some:
+        return None
+    u_0, v_0 = min(w.u_0 for w in some), min(w.v_0 for w in some)
+    u_1, v_1 = max(w.u_0 + w.n_u for w in some), max(w.v_0 + w.n_v for w in some)
+    return Window(u_0=u_0, v_0=v_0, n_u=u_1 - u_0, n_v=v_1 - v_0)
+
+
+def shadow_boxes(outlines: list[tuple[Frame, Array]], view: View, T_FW: dict[Frame, RigidTransform]) -> Array:
+    """(m, 2, 2): lowest and highest (u, v) of each outline."""
+    boxes = np.empty((len(outlines), 2, 2))
+    for k, (frame, corners) in enumerate(outlines):
         x = view.project(T_FW[frame].apply(corners))
         boxes[k] = x.min(axis=0), x.max(axis=0)
     return boxes
@@ -269,7 +336,7 @@ def add_transmission(
     T_FW: each frame's transform to W.  Raises InputError where a ray crosses more surfaces than `LARGEST`.
     """
     R, t, centre = compiled.in_world(T_FW)
-    boxes = shadow_boxes(compiled, view, T_FW)
+    boxes = shadow_boxes(list(zip(compiled.frame, compiled.corners, strict=True)), view, T_FW)
     c = (compiled.kind, compiled.p, R, t, compiled.ops, compiled.first, compiled.material, centre, compiled.radius,
          beam.w, beam.mu, view.source, view.O, view.U, view.V, boxes)
     I = np.empty((window.n_v + 1, window.n_u + 1))
@@ -289,4 +356,5 @@ def add_transmission(
     in_bands(corners, window.n_v + 1, threads)
     if not fine[0]:
         raise InputError(f"a ray crosses more than {LARGEST} surfaces of one solid; split the solid in several")
-    in_bands(lambda lo, hi: _cells(*common, I, seen, f, lo, hi, weight, out), window.n_v, threads)
+    rough = np.empty((window.n_v, window.n_u), dtype=np.bool_)
+    in_bands(lambda lo, hi: _cells(*common, I, seen, f, lo, hi, weight, out, rough), window.n_v, threads)

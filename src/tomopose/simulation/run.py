@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from typing import Any
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,12 +17,18 @@ from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.simulation.ball import ball_in_holder, ball_positions, silhouette_centre
-from tomopose.simulation.detector import Detector, expose
-from tomopose.simulation.projector import View, add_transmission, shadow
 from tomopose.simulation.blur import margin, to_pixels
+from tomopose.simulation.detector import Detector, expose
+from tomopose.simulation.effects import with_glare, with_mtf, with_scatter
+from tomopose.simulation.gvxr import add_gvxr_transmission
+from tomopose.simulation.materials import MATERIALS, Material
+from tomopose.simulation.mesh import Mesh, MeshSolid
+from tomopose.simulation.mesh_projector import add_mesh_transmission
+from tomopose.simulation.projector import View, add_transmission, enclosing, shadow
 from tomopose.simulation.rays import Compiled, compile_solids
 from tomopose.simulation.shapes import Solid
 from tomopose.simulation.spectrum import Beam, Spectrum, condense, tube_spectrum
+from tomopose.simulation.spot import FocalSpot, Motion
 from tomopose.units import Array, float_array
 
 
@@ -33,6 +40,10 @@ class SimulatedRun:
     T_HT:           the true mount.  T_MH: the true poses, which differ from `poses.T_MH` where the manipulator errs.
     t:              the ball's centre in M, mm, or None where no ball is imaged; ball_diameter, mm.
     solids, spectrum, detector: what is imaged, the spectrum as the detector weighs it, and the detector.
+    spot, motion:   focal spot, and movement during one exposure.
+    meshes:         solids given by triangles; they must not overlap each other or the other solids.
+    materials:      what the names of materials mean.
+    engine:         "own", or "gvxr" to let gVirtualXray cast the rays.
     seed:           of all random numbers.
     """
 
@@ -44,11 +55,18 @@ class SimulatedRun:
     spectrum: Spectrum
     detector: Detector
     seed: int
+    spot: FocalSpot = FocalSpot()
+    motion: Motion = Motion()
+    meshes: tuple[MeshSolid, ...] = ()
+    materials: Mapping[str, Material] = field(default_factory=lambda: MATERIALS)
+    engine: Literal["own", "gvxr"] = "own"
     t: Array | None = None
     ball_diameter: float | None = None
 
     def __post_init__(self) -> None:
         self.T_HT.require(Frame.H, Frame.T)
+        if not (self.solids or self.meshes):
+            raise InputError("there is nothing to image: the run has neither solids nor meshes")
         if len(self.T_MH.require(Frame.M, Frame.H)) != len(self.poses):
             raise ShapeError(f"{len(self.poses)} poses but {len(self.T_MH)} true poses")
         if self.t is not None:
@@ -57,19 +75,40 @@ class SimulatedRun:
     def __len__(self) -> int:
         return len(self.poses)
 
+    def __reduce__(self) -> tuple[object, tuple[dict[str, Any]]]:
+        # Mapping proxies cannot be pickled, and what is cached here is cheap to make again in another process.
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return _run, ({**values, "materials": dict(self.materials)},)
+
     @functools.cached_property
-    def compiled(self) -> Compiled:
-        return compile_solids(self.solids)
+    def compiled(self) -> Compiled | None:
+        return compile_solids(self.solids) if self.solids else None
+
+    @functools.cached_property
+    def beam_materials(self) -> tuple[str, ...]:
+        """The beam's columns: materials of the solids, then of the meshes."""
+        return tuple(dict.fromkeys(s.material for s in (*self.solids, *self.meshes)))
 
     @functools.cached_property
     def beam(self) -> Beam:
-        longest = np.zeros(len(self.compiled.materials))
-        np.add.at(longest, self.compiled.material, 2 * self.compiled.radius)
-        return condense(self.spectrum, self.compiled.materials, longest)
+        longest = dict.fromkeys(self.beam_materials, 0.0)
+        for solid in self.solids:
+            longest[solid.material] += 2 * solid.shape.bound()[1]
+        for mesh in self.meshes:
+            longest[mesh.material] += float(np.linalg.norm(mesh.corners[-1] - mesh.corners[0]))
+        return condense(self.spectrum, self.beam_materials, list(longest.values()), self.materials)
 
-    def frames(self, i: int) -> dict[Frame, RigidTransform]:
-        """Each frame's transform to W at pose i, by the true poses."""
-        T_TW = self.scanner.T_TW(self.poses.alpha[i])
+    @functools.cached_property
+    def tessellated(self) -> list[tuple[Mesh, str, Frame]]:
+        """(mesh, material, frame) of all that is imaged, for engines that know only triangles."""
+        from tomopose.simulation.tessellate import tessellate
+
+        return [*tessellate(self.solids), *((m.mesh, m.material, m.frame) for m in self.meshes)]
+
+    def frames(self, i: int, moment: float = 0.0) -> dict[Frame, RigidTransform]:
+        """Each frame's transform to W at pose i, by the true poses, at a moment between -1/2 and 1/2 of the exposure."""
+        moved = RigidTransform(R=np.eye(3), t=moment * np.array(self.motion.shift), source=Frame.W, target=Frame.W)
+        T_TW = moved @ self.scanner.T_TW(self.poses.alpha[i] + moment * self.motion.alpha)
         T_HW = T_TW @ self.T_HT
         return {
             Frame.W: RigidTransform.identity(Frame.W), Frame.T: T_TW, Frame.H: T_HW, Frame.M: T_HW @ self.T_MH[i],
@@ -103,19 +142,36 @@ class SimulatedRun:
         return document
 
 
+def _run(values: dict[str, Any]) -> SimulatedRun:
+    return SimulatedRun(**values)
+
+
 def transmission(run: SimulatedRun, i: int, *, threads: int = 1) -> Array:
-    """The noiseless image (n_v, n_u) of pose i as a share of the empty beam: geometry, spectrum, unsharpness."""
-    scanner, detector = run.scanner, run.detector
-    view, T_FW = View.of(scanner), run.frames(i)
-    sigma_u, sigma_v = detector.blur_sigma, detector.blur_sigma
+    """Image (n_v, n_u) of pose i as a share of the empty beam: geometry, spectrum, focal spot, motion, unsharpness."""
+    scanner, detector, spot, motion = run.scanner, run.detector, run.spot, run.motion
+    frames = run.frames(i)
+    depth = float(scanner.T_WS.apply(frames[Frame.M].t)[2])
+    spot_u, spot_v = spot.blur(scanner.d_SD / depth, scanner.p_u, scanner.p_v)
+    sigma_u, sigma_v = math.hypot(detector.blur_sigma, spot_u), math.hypot(detector.blur_sigma, spot_v)
+    moments, sources = motion.moments(), spot.sources()
+    views = [(View.of(scanner, shift), run.frames(i, moment)) for moment in moments for shift in sources]
     border = margin(max(sigma_u, sigma_v)) + 1
-    window = shadow(run.compiled, view, T_FW, scanner, border)
+    outlines = [(s.frame, s.shape.corners()) for s in run.solids] + [(m.frame, m.corners) for m in run.meshes]
+    window = enclosing([shadow(outlines, view, T_FW, scanner, border) for view, T_FW in views])
     out = np.ones(scanner.shape)
     if window is None:
         return out
     f = detector.cells
     cells = np.zeros((4, window.n_v * f, window.n_u * f), dtype=np.float32)
-    add_transmission(cells, window, run.compiled, run.beam, view, T_FW, f=f, threads=threads)
+    for view, T_FW in views:
+        share = {"f": f, "weight": 1 / len(views), "threads": threads}
+        if run.engine == "gvxr":
+            add_gvxr_transmission(cells, window, run, view, T_FW, f=f, weight=1 / len(views))
+        elif run.meshes:
+            add_mesh_transmission(cells, window, run.compiled, run.meshes, run.beam_materials, run.beam, view, T_FW, **share)
+        else:
+            assert run.compiled is not None
+            add_transmission(cells, window, run.compiled, run.beam, view, T_FW, **share)
     pixels = to_pixels(cells, f=f, sigma_u=sigma_u, sigma_v=sigma_v, threads=threads)
     v_0, u_0 = max(window.v_0, 0), max(window.u_0, 0)
     v_1, u_1 = min(window.v_0 + window.n_v, scanner.n_v), min(window.u_0 + window.n_u, scanner.n_u)
@@ -123,11 +179,29 @@ def transmission(run: SimulatedRun, i: int, *, threads: int = 1) -> Array:
     return out
 
 
+def signal(run: SimulatedRun, i: int, *, threads: int = 1) -> Array:
+    """What reaches the detector's electronics at pose i, without noise: transmission, MTF, scatter, glare, lag."""
+    detector = run.detector
+
+    def alone(k: int) -> Array:
+        T = transmission(run, k, threads=threads)
+        if detector.mtf is not None:
+            T = with_mtf(T, detector.mtf)
+        return with_glare(with_scatter(T, detector.scatter), detector.glare)
+
+    now = alone(i)
+    if not detector.lag:
+        return now
+    # Before the first frame the detector saw what it sees in the first.
+    before = [share * (alone(i - k) if i >= k else now) for k, share in enumerate(detector.lag, start=1)]
+    return np.asarray((1 - sum(detector.lag)) * now + np.sum(before, axis=0))
+
+
 def render(run: SimulatedRun, i: int, *, threads: int = 1) -> Any:
     """Radiograph i of a run, uint16 (n_v, n_u), row index = v.  The bytes do not depend on `threads`."""
     if not 0 <= i < len(run):
         raise InputError(f"frame {i} does not exist; the run has {len(run)} frames, from 0")
-    return expose(transmission(run, i, threads=threads), run.detector, seed=run.seed, frame=i, threads=threads)
+    return expose(signal(run, i, threads=threads), run.detector, run.scanner, seed=run.seed, frame=i, threads=threads)
 
 
 def simulate_ball_run(

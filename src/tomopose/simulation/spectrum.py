@@ -53,11 +53,12 @@ class Spectrum:
             weight=self.weight * np.exp(-attenuation(material, self.energy, materials=materials) * thickness),
         )
 
-    def absorbed_energy(self, material: Material | str, thickness: float) -> Spectrum:
+    def absorbed_energy(self, material: Material | str, thickness: float, materials: Mapping[str, Material] = MATERIALS
+                        ) -> Spectrum:
         """As an energy-integrating scintillator of that material and thickness (mm) weighs it."""
         if not thickness > 0:
             raise InputError(f"scintillator: thickness is {thickness} mm; a positive number is needed")
-        absorbed = 1 - np.exp(-attenuation(material, self.energy) * thickness)
+        absorbed = 1 - np.exp(-attenuation(material, self.energy, materials=materials) * thickness)
         return Spectrum(energy=self.energy, weight=self.weight * absorbed * self.energy)
 
 

@@ -1,0 +1,109 @@
+"""Effects on the noiseless image that no ray shows: scatter, veiling glare, a measured MTF, wide blur in general."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import fft, ndimage
+
+from tomopose.errors import InputError
+from tomopose.units import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scatter:
+    """constant: share of the empty beam added everywhere.  amount, sigma (px): scatter that the object makes, as
+    amount x Gaussian * (-T ln T), the forward-scatter potential of kernel-superposition models (Ohnesorge, Flohr and
+    Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563)."""
+
+    constant: float = 0.0
+    amount: float = 0.0
+    sigma: float = 100.0
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.constant < 1 and 0 <= self.amount < 10 and self.sigma > 0):
+            raise InputError(
+                f"scatter: constant {self.constant}, amount {self.amount}, sigma {self.sigma} px; constant lies in [0, 1), "
+                "amount in [0, 10), sigma above 0"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Glare:
+    """share of the light in the scintillator and its housing that spreads over a Gaussian of sigma px."""
+
+    share: float = 0.0
+    sigma: float = 200.0
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.share < 1 and self.sigma > 0):
+            raise InputError(f"glare: share {self.share}, sigma {self.sigma} px; share lies in [0, 1), sigma above 0")
+
+
+def wide_blur(image: Array, sigma: float) -> Array:
+    """Gaussian blur of a wide sigma (px): on an image averaged over blocks, interpolated back."""
+    step = max(1, int(sigma / 4))
+    n_v, n_u = image.shape
+    pad = ((0, -n_v % step), (0, -n_u % step))
+    padded = np.pad(image, pad, mode="edge")
+    small = padded.reshape(padded.shape[0] // step, step, padded.shape[1] // step, step).mean(axis=(1, 3))
+    small = ndimage.gaussian_filter(small, sigma / step, mode="nearest")
+    v = np.clip((np.arange(n_v) + 0.5) / step - 0.5, 0, small.shape[0] - 1)
+    u = np.clip((np.arange(n_u) + 0.5) / step - 0.5, 0, small.shape[1] - 1)
+    rows = _interpolate(small, v)
+    return _interpolate(rows.T, u).T
+
+
+def _interpolate(a: Array, x: Array) -> Array:
+    k = np.minimum(x.astype(np.intp), max(len(a) - 2, 0))
+    upper = np.minimum(k + 1, len(a) - 1)
+    w = (x - k)[:, None]
+    return np.asarray(a[k] * (1 - w) + a[upper] * w)
+
+
+def with_scatter(T: Array, scatter: Scatter) -> Array:
+    """Primary plus scattered radiation."""
+    if scatter.amount > 0:
+        T = T + scatter.amount * wide_blur(-T * np.log(np.maximum(T, 1e-30)), scatter.sigma)
+    return T + scatter.constant if scatter.constant > 0 else T
+
+
+def with_glare(T: Array, glare: Glare) -> Array:
+    """The image with a veil over it; an even image stays as it is."""
+    return (1 - glare.share) * T + glare.share * wide_blur(T, glare.sigma) if glare.share > 0 else T
+
+
+@dataclass(frozen=True, kw_only=True)
+class MTF:
+    """A measured modulation transfer function: values at spatial frequencies, cycles per px, rotationally symmetric.
+
+    Begins with 1 at frequency 0; beyond the last frequency it falls linearly to 0 within one more step.
+    """
+
+    frequency: tuple[float, ...]
+    value: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        f, m = np.asarray(self.frequency, dtype=np.float64), np.asarray(self.value, dtype=np.float64)
+        if f.shape != m.shape or f.ndim != 1 or len(f) < 2 or (np.diff(f) <= 0).any() or f[0] != 0 or m[0] != 1:
+            raise InputError("an MTF needs rising frequencies from 0 (cycles per px) and values that begin with 1")
+        if not (np.isfinite(m).all() and (m >= 0).all() and (m <= 1.5).all()):
+            raise InputError("the values of an MTF lie between 0 and 1.5")
+        # Tuples, so that a detector can be a key.
+        object.__setattr__(self, "frequency", tuple(f.tolist()))
+        object.__setattr__(self, "value", tuple(m.tolist()))
+
+    def at(self, f: Any) -> Array:
+        last = self.frequency[-1] + (self.frequency[-1] - self.frequency[-2])
+        return np.interp(f, np.append(self.frequency, last), np.append(self.value, 0.0))
+
+
+def with_mtf(T: Array, mtf: MTF, border: int = 32) -> Array:
+    """The image under that MTF (besides the Gaussian blur and the pixel's own area)."""
+    n_v, n_u = (fft.next_fast_len(n + 2 * border, real=True) for n in T.shape)
+    padded = np.pad(T, ((border, n_v - T.shape[0] - border), (border, n_u - T.shape[1] - border)), mode="edge")
+    f = np.hypot(fft.fftfreq(n_v)[:, None], fft.rfftfreq(n_u)[None, :])
+    filtered = fft.irfft2(fft.rfft2(padded) * mtf.at(f), s=padded.shape)
+    return np.asarray(filtered[border : border + T.shape[0], border : border + T.shape[1]])
