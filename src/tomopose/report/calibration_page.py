@@ -36,6 +36,7 @@ from tomopose.report.words import (
     NOT_DETERMINABLE,
     NOT_GIVEN,
     cell,
+    decimals,
     heading,
     meaning,
     number,
@@ -121,7 +122,7 @@ def _verdict(calibration: Calibration) -> Verdict:
 def _key_figures(calibration: Calibration, scan: ProjectionMatrices | None) -> list[KeyFigure]:
     chi2 = calibration.chi2_dof
     keys = [
-        KeyFigure(name="Reprojection error d_rms", value=f"{calibration.d_rms:.4f} px", note="eq. (8)"),
+        KeyFigure(name="Reprojection error d_rms", value=f"{number(calibration.d_rms)} px", note="eq. (8)"),
         KeyFigure(name="… at the object", value=f"{number(calibration.d_rms_um)} µm", note="pitch over magnification"),
         KeyFigure(
             name="χ² per degree of freedom",
@@ -227,8 +228,8 @@ def _residuals(calibration: Calibration, joined: Joined) -> Section:
         blocks.append(Words(paragraphs=[f"Residuals by rotation and by coordinate: {NOT_GIVEN} (no pose table)."]))
     return Section(
         title="How well the data fit",
-        lead=f"Reprojection error {calibration.d_rms:.4f} px, {number(calibration.d_rms_um)} µm at the object. A small "
-        "residual alone proves little: see what the poses can tell.",
+        lead=f"Reprojection error {number(calibration.d_rms)} px, {number(calibration.d_rms_um)} µm at the object. A "
+        "small residual alone proves little: see what the poses can tell.",
         blocks=[b for b in blocks if b is not None],
     )
 
@@ -271,11 +272,12 @@ def _pose_table(joined: Joined, observations: BallObservations | None) -> Table:
     if observations is not None and observations.snr is not None:
         snr = dict(zip(observations.pose_id, map(float, observations.snr), strict=True))
     rows = []
+    k_px = decimals(joined.d)
     for k in np.argsort(-joined.d, kind="stable"):
         pose = joined.pose_id[k]
         rows.append(
-            [pose, joined.group[k] if joined.group else "–", f"{joined.x_D[k, 0]:.3f}", f"{joined.x_D[k, 1]:.3f}",
-             f"{joined.r[k, 0]:+.4f}", f"{joined.r[k, 1]:+.4f}", f"{joined.d[k]:.4f}",
+            [pose, joined.group[k] if joined.group else "–", f"{joined.x_D[k, 0]:.4f}", f"{joined.x_D[k, 1]:.4f}",
+             f"{joined.r[k, 0]:+.{k_px}f}", f"{joined.r[k, 1]:+.{k_px}f}", f"{joined.d[k]:.{k_px}f}",
              f"{np.linalg.norm(joined.z[k]):.2f}", number(snr[pose]) if np.isfinite(snr.get(pose, np.nan)) else "–"]
         )
     return Table(
@@ -303,9 +305,12 @@ def _observability(calibration: Calibration) -> Section:
         )
         lead = "All parameters solved for are held by these poses."
     if seen.notes:
-        blocks.append(Words(title="What would help", items=seen.notes, wide=False))
+        blocks.append(Words(title="What is taken as known, and what would help", items=seen.notes, wide=False))
     else:
         blocks.append(Words(title="What would help", paragraphs=["Nothing was proposed."], wide=False))
+    alike = sum(1 for row in calibration.hypotheses if str(row.get("verdict", "")).startswith("cannot be told apart"))
+    if alike:
+        lead += f" Rival conventions that they cannot tell from the declared one: {alike}, see below."
     blocks += [coverage_figures.correlation_map(calibration), coverage_figures.singular_values(calibration)]
     blocks += _hypotheses(calibration.hypotheses)
     return Section(title="What the poses can tell", lead=lead, blocks=blocks)

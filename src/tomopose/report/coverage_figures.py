@@ -227,7 +227,7 @@ def scan_effect(scan: ProjectionMatrices) -> Figure | None:
         traces.append(
             {
                 "type": "scatter", "mode": "lines", "x": number, "y": values, "name": name,
-                "line": {"color": colour, "width": 1.8}, "hovertemplate": "view %{x}: %{y:.4f} px<extra></extra>",
+                "line": {"color": colour, "width": 1.8}, "hovertemplate": "view %{x}: %{y:.4~g} px<extra></extra>",
             }
         )
     return Figure(

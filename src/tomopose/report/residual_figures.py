@@ -11,6 +11,7 @@ from tomopose.calibration.result import Calibration
 from tomopose.report.gather import Joined, minutes
 from tomopose.report.page import Figure, Table
 from tomopose.report.style import ACCENT, ALERT, LINE, ORANGE, ROTATION_COLOURS, SOFT, axis, layout
+from tomopose.report.words import decimals, number
 from tomopose.units import Array
 
 ARROW_SHARE = 0.09
@@ -51,8 +52,8 @@ def quiver(calibration: Calibration, joined: Joined) -> Figure:
             "type": "scatter", "mode": "markers", "x": x[:, 0], "y": x[:, 1], "showlegend": False,
             "marker": {"size": 4, "color": SOFT},
             "customdata": [[p, *row, d] for p, row, d in zip(joined.pose_id, r, joined.d, strict=True)],
-            "hovertemplate": "pose %{customdata[0]}<br>u %{customdata[1]:.4f} px, v %{customdata[2]:.4f} px"
-            "<br>length %{customdata[3]:.4f} px<extra></extra>",
+            "hovertemplate": "pose %{customdata[0]}<br>u %{customdata[1]:.4~g} px, v %{customdata[2]:.4~g} px"
+            "<br>length %{customdata[3]:.4~g} px<extra></extra>",
         },
         {
             "type": "scatter", "mode": "lines+text", "x": [key_u, key_u + scale * unit], "y": [key_v, key_v],
@@ -89,14 +90,14 @@ def by_pose(joined: Joined) -> Figure:
                     "type": "scatter", "mode": "markers", "name": f"rotation {name}" if joined.group else "poses",
                     "x": joined.number[rows], "y": joined.d[rows], "text": [joined.pose_id[k] for k in rows],
                     "marker": {"size": 7, "color": ROTATION_COLOURS.get(name, ACCENT), "line": {"width": 0}},
-                    "hovertemplate": "pose %{text}<br>d = %{y:.4f} px<extra></extra>",
+                    "hovertemplate": "pose %{text}<br>d = %{y:.4~g} px<extra></extra>",
                 }
             )
     rms = float(np.sqrt(np.mean(joined.d**2)))
     ends = [float(joined.number.min()), float(joined.number.max())]
     data.append(
         {
-            "type": "scatter", "mode": "lines", "x": ends, "y": [rms, rms], "name": f"d_rms = {rms:.4f} px",
+            "type": "scatter", "mode": "lines", "x": ends, "y": [rms, rms], "name": f"d_rms = {number(rms)} px",
             "line": {"color": SOFT, "width": 1.3, "dash": "dash"}, "hoverinfo": "skip",
         }
     )
@@ -124,7 +125,7 @@ def over_sequence(joined: Joined) -> Figure:
                 "type": "scatter", "mode": "markers", "name": name, "x": joined.number[order], "y": values,
                 "marker": {"size": 4.5, "color": colour, "opacity": 0.55},
                 "text": [joined.pose_id[i] for i in order],
-                "hovertemplate": f"pose %{{text}}<br>{name} %{{y:.4f}} px<extra></extra>",
+                "hovertemplate": f"pose %{{text}}<br>{name} %{{y:.4~g}} px<extra></extra>",
             }
         )
         if len(order) > width:
@@ -182,7 +183,7 @@ def by_coordinate(joined: Joined) -> Figure | None:
                     "type": "scatter", "mode": "markers", "name": name, "x": x, "y": joined.r[:, k],
                     "xaxis": f"x{suffix}", "yaxis": f"y{suffix}", "legendgroup": name, "showlegend": panel == 0,
                     "marker": {"size": 4, "color": colour, "opacity": 0.55}, "text": joined.pose_id,
-                    "hovertemplate": f"pose %{{text}}<br>{name} %{{y:.4f}} px<extra></extra>",
+                    "hovertemplate": f"pose %{{text}}<br>{name} %{{y:.4~g}} px<extra></extra>",
                 }
             )
     return Figure(
@@ -203,13 +204,14 @@ def rotation_table(calibration: Calibration, joined: Joined) -> Table | None:
     to_um = np.sqrt(calibration.scanner.p_u * calibration.scanner.p_v) / calibration.scanner.magnification * 1000.0
     groups = np.array(joined.group)
     rows = []
+    k_px, k_um = decimals(joined.d), decimals(joined.d * to_um, fewest=2)
     for name in [g for g in ROTATION_COLOURS if (groups == g).any()]:
         k = groups == name
         rms = float(np.sqrt(np.mean(joined.d[k] ** 2)))
         mean = joined.r[k].mean(axis=0)
         rows.append(
-            [name, int(k.sum()), f"{rms:.4f}", f"{rms * to_um:.2f}", f"{joined.d[k].max():.4f}", f"{mean[0]:+.4f}",
-             f"{mean[1]:+.4f}"]
+            [name, int(k.sum()), f"{rms:.{k_px}f}", f"{rms * to_um:.{k_um}f}", f"{joined.d[k].max():.{k_px}f}",
+             f"{mean[0]:+.{k_px}f}", f"{mean[1]:+.{k_px}f}"]
         )
     return Table(
         title="Residuals by rotation axis",

@@ -126,7 +126,7 @@ def ball_scene(calibration: Calibration, joined: Joined) -> Figure | None:
     )
     dots["text"] = joined.pose_id
     dots["hovertemplate"] = (
-        "pose %{text}<br>%{x:.2f}, %{y:.2f}, %{z:.2f} mm<br>d = %{marker.color:.4f} px<extra></extra>"
+        "pose %{text}<br>%{x:.2f}, %{y:.2f}, %{z:.2f} mm<br>d = %{marker.color:.4~g} px<extra></extra>"
     )
     return Figure(
         title="Where the ball was",

@@ -41,6 +41,7 @@ def axis(title: str = "", **changes: Any) -> dict[str, Any]:
         "ticklen": 4,
         "tickcolor": "#aab4c0",
         "automargin": True,
+        "exponentformat": "none",
         **changes,
     }
 
@@ -79,6 +80,7 @@ def colour_bar(title: str, **changes: Any) -> dict[str, Any]:
         "title": {"text": title, "side": "right", "font": {"size": 12}},
         "thickness": 12,
         "outlinewidth": 0,
+        "exponentformat": "none",
         "tickfont": {"size": 11},
         **changes,
     }

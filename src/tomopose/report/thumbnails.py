@@ -11,6 +11,7 @@ import numpy as np
 from tomopose.errors import ShapeError
 from tomopose.observations import BallObservations
 from tomopose.report.png import data_uri, grey_levels, grey_png
+from tomopose.report.words import number
 from tomopose.units import Array, float_array
 
 OUTLINE_POINTS = 120
@@ -132,7 +133,8 @@ def worst_thumbnails(
     made = []
     for k in order[:count]:
         d = None if residuals is None else residuals.get(observations.pose_id[k])
-        text = f"d = {d:.3f} px" if d is not None else (f"σ = {sigma[k]:.4f} px" if np.isfinite(sigma[k]) else "")
+        known = "" if not np.isfinite(sigma[k]) else f"σ = {number(sigma[k])} px"
+        text = known if d is None else f"d = {number(d)} px"
         made.append(thumbnail(observations, k, images[k], text=text))
     return tuple(made)
 

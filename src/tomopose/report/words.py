@@ -87,6 +87,13 @@ def number(value: Any) -> str:
     return f"{x:.{min(max(2 - exponent, 0), 8)}f}" if -5 <= exponent < 6 else f"{x:.3g}"
 
 
+def decimals(values: Any, *, fewest: int = 4) -> int:
+    """Digits after the point that show two figures of the rms of values, never fewer than `fewest`."""
+    x = np.asarray(values, dtype=np.float64)
+    rms = float(np.sqrt(np.mean(x**2))) if x.size else 0.0
+    return max(fewest, 1 - math.floor(math.log10(rms))) if math.isfinite(rms) and rms > 0 else fewest
+
+
 def cell(value: Any) -> str:
     """Any value of a result as the text of a table cell."""
     if value is None:
