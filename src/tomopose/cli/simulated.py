@@ -1,11 +1,10 @@
-"""A simulated run to files: 16-bit TIFF, poses.csv, scanner.json, truth.json; resumable, in several processes."""
+"""A simulated run to files: 16-bit TIFF, poses.csv, scanner.json, truth.json; resumable, several at once."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -58,14 +57,8 @@ def write_run(
 
     told(done)
     rows = run.scanner.image_rows
-    if workers == 1:
-        for k, path in missing:
-            _write_one(run, k, path, rows)
-            done += 1
-            told(done)
-        return
-    # Fresh interpreters: a forked copy of a process whose kernels already run threads can hang.
-    with ProcessPoolExecutor(max_workers=workers, mp_context=get_context("spawn")) as pool:
+    # Threads, not processes: the kernels release the interpreter, and nothing has to be compiled or loaded twice.
+    with ThreadPoolExecutor(max_workers=workers) as pool:
         jobs = [pool.submit(_write_one, run, k, path, rows) for k, path in missing]
         try:
             for job in as_completed(jobs):
