@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose
 
-from tomopose import PoseSequence, RigidTransform, Scanner
+from tomopose import BallObservations, PoseSequence, RigidTransform, Scanner, calibrate
+from tomopose.calibration.exact import d_rms_exact
+from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import eq5_matrices, project_ball
 from tomopose.geometry.rotations import R_x, R_y, R_z, angles_from_rotation, rotation_from_angles
@@ -107,6 +110,32 @@ def test_eq_5_sees_the_ball_where_eq_6_sees_it(scanner, T_HT, rng):
     P = eq5_matrices(scanner, T_HT=T_HT, T_MH=poses.T_MH)
     h = P @ np.append(T_HT.apply(t), 1)
     assert_allclose(h[:, :2] / h[:, 2:], project_ball(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=t), atol=PIXEL)
+
+
+def test_eq_8_divides_by_the_number_of_poses(scanner, T_HT, rng):
+    positions, angles = random_poses(rng, 20)
+    poses = PoseSequence.from_table(positions, angles)
+    x_D = project_ball(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=[3.0, -2.0, 8.0]) + rng.normal(scale=0.02, size=(20, 2))
+    calibration = calibrate(scanner, poses, BallObservations.from_sigma(x_D, 0.02), hypotheses=False)
+    calculated = project_ball(scanner, T_HT=calibration.T_HT, T_MH=poses.T_MH, t=calibration.t)
+    d = np.sqrt(((x_D - calculated) ** 2).sum(axis=1))
+    assert_allclose(calibration.d, d, atol=1e-9)
+    assert_allclose(calibration.d_rms, np.sqrt((d**2).sum() / 20), rtol=1e-9)
+
+
+def test_eq_9_uses_the_exact_parameters(scanner, T_HT, rng):
+    positions, angles = random_poses(rng, 20)
+    poses = PoseSequence.from_table(positions, angles)
+    t = np.array([3.0, -2.0, 8.0])
+    error = rng.normal(scale=0.02, size=(20, 2))
+    x_D = project_ball(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=t) + error
+    order = rng.permutation(20)
+    observations = BallObservations.from_sigma(x_D[order], 0.02, pose_id=order)
+    expected = np.sqrt((error**2).sum() / 20)
+    assert_allclose(d_rms_exact(scanner, poses, observations, T_HT=T_HT, t=t), expected, rtol=1e-9)
+    assert_allclose(d_rms_exact(scanner, poses, observations, T_HT=T_HT, t={0: t}), expected, rtol=1e-9)
+    with pytest.raises(InputError, match="ball 0"):
+        d_rms_exact(scanner, poses, observations, T_HT=T_HT, t={1: t})
 
 
 def test_appendix_product_and_angle_extraction(rng):
