@@ -14,6 +14,7 @@ import argparse
 import os
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "2")
 
@@ -37,6 +38,7 @@ ROBOT = typical_robot()
 WORN = Disturbance(
     backlash_mm=0.003, growth_mm=(0.001, -0.002, 0.004), growth_rad=(5e-6, -8e-6, 4e-6), time_constant=60.0
 )
+WORN_LEGS = replace(WORN, backlash_mm=0.0, leg_backlash_mm=0.003)
 
 CASES: dict[str, Callable[[int], Experiment]] = {
     "paper's 189 poses": lambda s: hexapod_experiment(HEXAPOD, "paper", s),
@@ -49,6 +51,8 @@ CASES: dict[str, Callable[[int], Experiment]] = {
     "6R robot, two balls, known distance": lambda s: robot_experiment(ROBOT, s, balls=2),
     "mixed, backlash 3 um and drift": lambda s: hexapod_experiment(HEXAPOD, "mixed", s, disturbance=WORN),
     "paper's, backlash 3 um and drift": lambda s: hexapod_experiment(HEXAPOD, "paper", s, disturbance=WORN),
+    "paper's, leg backlash 3 um and drift": lambda s: hexapod_experiment(HEXAPOD, "paper", s, disturbance=WORN_LEGS),
+    "mixed, leg backlash 3 um and drift": lambda s: hexapod_experiment(HEXAPOD, "mixed", s, disturbance=WORN_LEGS),
     "nothing wrong, paper's poses": lambda s: hexapod_experiment(HEXAPOD, "paper", s, size=0.0),
     "nothing wrong, mixed poses": lambda s: hexapod_experiment(HEXAPOD, "mixed", s, size=0.0),
 }

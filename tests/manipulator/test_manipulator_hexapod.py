@@ -111,8 +111,8 @@ def test_singular_platform_is_named(rng: np.random.Generator) -> None:
     """A platform that is a scaled copy of its base can turn about the vertical without changing a leg."""
     machine = typical_hexapod()
     copy = machine.base_joints * [0.5, 0.5, 1.0] + [0, 0, 200.0]
+    singular = replace(machine, platform_joints=copy)
     with pytest.raises(TrajectoryError, match="singular") as caught:
-        singular = replace(machine, platform_joints=copy)
         singular.real_poses(some_poses(rng), np.zeros(len(singular.names)))
     assert len(caught.value.indices) == 17
 

@@ -16,7 +16,7 @@ from scipy.special import chdtri
 
 from tomopose.calibration.kinematic_fit import ModelFit, fit_model
 from tomopose.calibration.kinematic_solve import KinematicProblem, State, singular_values
-from tomopose.calibration.model_choice import Judgement, better, by_rotation, judge
+from tomopose.calibration.model_choice import EVIDENCE_GAIN, Judgement, better, by_rotation, judge
 from tomopose.calibration.multi_ball import require_balls_not_swapped
 from tomopose.calibration.parameters import FreeParameters, adjusted_scanners, free_parameters, unit_of
 from tomopose.calibration.problem import Problem, pair
@@ -24,7 +24,7 @@ from tomopose.calibration.result import Calibration, Observability, Parameter
 from tomopose.calibration.run_changes import change_in_words, find_change, require_same_pivot
 from tomopose.calibration.slack import determined_turns, map_candidates
 from tomopose.calibration.uncertainty import WIDENING_PROBABILITY, angles_by_tangent
-from tomopose.errors import InputError
+from tomopose.errors import InputError, NotConvergedError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import angles_from_rotation
 from tomopose.geometry.scanner import Scanner
@@ -36,12 +36,17 @@ from tomopose.manipulator.inverse import InverseManipulator
 from tomopose.manipulator.pose_map import PoseMap
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import ErrorModel, Repeatability
+from tomopose.manipulator.run_effects import WithRunEffects, with_run_effects
 from tomopose.manipulator.serial import SerialRobot
 from tomopose.observations import BallObservations
 from tomopose.provenance import provenance
 from tomopose.units import Array
 
 MODELS = ("auto", "rigid", "kinematic", "slack")
+RUN_EFFECTS_FOUND = (
+    "during the run the manipulator drifted or its drives lagged (drift and lag are among the parameters): the scan "
+    "may be off by as much again"
+)
 LARGE_SCATTER = 9.0
 """A scatter whose variance is this many times the stated one means an error that no model here holds."""
 
@@ -64,10 +69,10 @@ def calibrate_kinematic(
     Parameters
     ----------
     scanner, poses, observations: as in `calibrate`.
-    rigid:        the calibration that trusts the poses: start, and the answer if "auto" finds no better.
+    rigid:        the calibration that trusts the poses: start, and the answer if auto finds no better.
     manipulator:  Hexapod, SerialRobot, content or path of hexapod.json or robot.json; None for "slack".
-    model:        "kinematic": the machine's errors; "slack": scatter and a smooth map of pose errors, for machines whose
-                  kinematics nobody knows; "rigid": none; "auto": kinematic where evidence and held-out poses both say
+    model:        "kinematic": the machine's errors; "slack": scatter and a smooth map of pose errors, for machines
+                  whose kinematics nobody knows; "rigid": none; "auto": kinematic where evidence and held-out poses both say
                   that it is better, else rigid.
     free:         freed scanner parameters with priors; by default those of the rigid calibration.
     distances:    (ball id, ball id) -> (distance, standard uncertainty), mm: scale bars.
@@ -190,11 +195,28 @@ def _fit_all(
         errors = np.zeros(0 if machine is None else len(machine.names))
         own = replace(problem, model=machine)
         if keep is None:
-            fits[name] = fit_model(own, replace(start, p=errors), robust=robust)
+            fits[name] = _with_run_effects(own, fit_model(own, replace(start, p=errors), robust=robust))
             keep = fits[name].keep
         else:
             fits[name] = fit_model(own, replace(start, p=errors), keep=keep)
     return dict(reversed(fits.items()))
+
+
+def _with_run_effects(problem: KinematicProblem, fit: ModelFit) -> ModelFit:
+    """The fit with drift and lag of the run beside the machine's errors, where more than its scatter is left and the
+    evidence is for them; else the fit as it is."""
+    estimate = fit.estimate
+    machine = estimate.problem.model
+    if machine is None or fit.scatter <= 1.0 or machine.kind == "map":
+        return fit
+    model = with_run_effects(machine, problem.poses)
+    more = np.zeros(len(model.names) - len(machine.names))
+    start = replace(estimate.state, p=np.concatenate([estimate.state.p, more]))
+    try:
+        other = fit_model(replace(problem, model=model), start, keep=fit.keep, resize=False)
+    except NotConvergedError:
+        return fit
+    return replace(other, size=fit.size) if other.estimate.log_evidence > estimate.log_evidence + EVIDENCE_GAIN else fit
 
 
 def _sound_run(fits: Mapping[str, ModelFit], problem: KinematicProblem) -> tuple[str, ...]:
@@ -264,9 +286,13 @@ def _calibration(
     block: dict[str, Any] = {}
     notes: list[str] = []
     if model is not None:
+        before = len(e.problem.tangent) - len(model.names)
+        if isinstance(model, WithRunEffects):
+            model = model.machine  # drift and lag of this run are no property of the machine
+            doubts = (*doubts, RUN_EFFECTS_FOUND)
         m = len(model.names)
-        u = np.sqrt(np.diag(e.covariance))[-m:]
-        block = manipulator_block(model, e.state.p, u, problem.poses)
+        u = np.sqrt(np.diag(e.covariance))[before : before + m]
+        block = manipulator_block(model, e.state.p[:m], u, problem.poses)
         gamma = m - float(np.sum((u / model.sigma) ** 2))
         notes.append(
             f"the radiographs determine {gamma:.1f} of {m} errors of the manipulator; the others, and shifts and turns "

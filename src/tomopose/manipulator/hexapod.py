@@ -138,7 +138,11 @@ class Hexapod:
 
     def leg_lengths(self, R: Array, t: Array) -> Array:
         """Nominal legs (n, 6), mm, of poses R (n, 3, 3), t (n, 3): what the controller sends to its drives."""
-        return _legs(self.base_joints, self.platform_joints, R, t)[0]
+        return self.legs(R, t)[0]
+
+    def legs(self, R: Array, t: Array) -> tuple[Array, Array]:
+        """Nominal legs (n, 6), mm, and A (n, 6, 6), their derivative by the plate's motion (w, t)."""
+        return _legs(self.base_joints, self.platform_joints, R, t)
 
     def forward(self, legs: Array, R_start: Array, t_start: Array) -> tuple[Array, Array]:
         """Nominal poses (R, t) of leg lengths (n, 6), by Newton's method from poses nearby."""

@@ -17,6 +17,7 @@ from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.hexapod import Hexapod
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import ErrorModel, Repeatability, moved
+from tomopose.manipulator.run_effects import last_direction
 from tomopose.manipulator.serial import Joint, SerialRobot
 from tomopose.units import Array
 
@@ -73,29 +74,28 @@ def typical_robot(
 class Disturbance:
     """What no geometry model holds.
 
-    backlash_mm:  play of the drives: the plate's origin lags by half of it behind each change of direction, per axis.
+    backlash_mm:  play of guides: the plate's origin lags by half of it behind its last move, per axis.
+    leg_backlash_mm: play of a hexapod's legs, likewise.
     growth_mm:    shift (3,) of the plate reached when the machine is warm; growth_rad: the turn (3,) likewise.
     time_constant: poses after which 63 % of the growth is reached.
     scatter:      repeatability from pose to pose.
     """
 
     backlash_mm: float = 0.0
+    leg_backlash_mm: float = 0.0
     growth_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     growth_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     time_constant: float = 60.0
     scatter: Repeatability = field(default_factory=Repeatability)
 
 
-def lag_of_backlash(t: Array, play: float) -> Array:
-    """(n, 3), mm: how far the plate lags behind commanded positions t (n, 3), in order, with that play in each axis.
+def lag_of_backlash(x: Array, play: float) -> Array:
+    """(n, k), mm: how far axes lag behind commanded positions x (n, k), in order, with that play.
 
-    The drive pushes one flank: after a move in + the plate stands play/2 short, after a move in - play/2 beyond; an
-    axis that does not move keeps its flank.
+    The drive pushes one flank: after a move in + an axis stands play/2 short, after a move in - play/2 beyond; an axis
+    that does not move keeps its flank, and all begin on that of a move in +.
     """
-    direction = np.sign(np.diff(t, axis=0, prepend=t[:1] - 1.0))
-    for k in range(1, len(direction)):
-        direction[k] = np.where(direction[k] == 0, direction[k - 1], direction[k])
-    return -0.5 * play * direction
+    return -0.5 * play * last_direction(np.concatenate([x[:1] - 1.0, x]), 0.0)[1:]
 
 
 def real_motion(
@@ -115,6 +115,9 @@ def real_motion(
         delta[:, :3] = warm[:, None] * np.asarray(disturbance.growth_rad)
         delta[:, 3:] = warm[:, None] * np.asarray(disturbance.growth_mm)
         delta[:, 3:] += lag_of_backlash(poses.T_MH.t, disturbance.backlash_mm)
+        if isinstance(machine, Hexapod) and disturbance.leg_backlash_mm:
+            legs, A = machine.legs(poses.T_MH.R, poses.T_MH.t)
+            delta += np.linalg.solve(A, lag_of_backlash(legs, disturbance.leg_backlash_mm)[:, :, None])[..., 0]
         if disturbance.scatter.variance.any():
             if rng is None:
                 raise InputError("a machine that scatters needs a random generator (rng)")

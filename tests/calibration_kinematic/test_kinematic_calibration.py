@@ -1,0 +1,214 @@
+"""A manipulator's errors found from radiographs of one ball, and what is left of the trajectory error."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from manipulator_cases import (
+    ROBOT_BALLS,
+    Experiment,
+    hexapod_experiment,
+    robot_experiment,
+    trajectory_error,
+)
+
+from tomopose import BallObservations, Calibration
+from tomopose.calibration.kinematic import calibrate_kinematic, machine_of
+from tomopose.calibration.model_choice import EVIDENCE_GAIN
+from tomopose.calibration.solve import calibrate
+from tomopose.errors import InputError
+from tomopose.io.calibration_json import read_calibration, write_calibration
+from tomopose.manipulator.error_models import corrected_poses
+from tomopose.manipulator.virtual import Disturbance, typical_hexapod, typical_robot
+
+HEXAPOD, ROBOT = typical_hexapod(), typical_robot()
+
+
+def rigid_of(e: Experiment, **changes: Any) -> Calibration:
+    return calibrate(
+        e.scanner, changes.get("poses", e.poses), changes.get("observations", e.observations), model="rigid",
+        hypotheses=False,
+    )
+
+
+def found(e: Experiment, model: str = "auto", **options: Any) -> Calibration:
+    poses, observations = options.pop("poses", e.poses), options.pop("observations", e.observations)
+    options.setdefault("manipulator", e.machine)
+    rigid = rigid_of(e, poses=poses, observations=observations)
+    return calibrate_kinematic(e.scanner, poses, observations, rigid=rigid, model=model, **options)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "goal_px"),
+    [("paper", {}, 0.08), ("mixed", {}, 0.02), ("mixed", {"geometry": 1.08}, 0.025), ("mixed", {"balls": 2}, 0.012)],
+)
+def test_platform_errors_are_found(kind: str, options: dict[str, Any], goal_px: float) -> None:
+    """Joint errors of 0.1 mm: the scan's error falls from about 1 px to hundredths."""
+    e = hexapod_experiment(HEXAPOD, kind, 3, **options)
+    rigid, cal = rigid_of(e), found(e)
+    before, (after, stated, _) = trajectory_error(rigid, e)[0], trajectory_error(cal, e)
+    assert cal.model == "kinematic"
+    assert before > 0.25
+    assert after < goal_px
+    assert after < 3 * stated
+    assert abs(cal.chi2_dof - 1) < 0.3
+    assert cal.verdict == "trustworthy", cal.reasons
+
+
+def test_stated_uncertainty_covers() -> None:
+    """Squared errors in stated standard deviations average to about 1 over seeded runs (a few directions dominate)."""
+    share, ratio = [], []
+    for seed in range(10):
+        e = hexapod_experiment(HEXAPOD, "mixed", seed)
+        after, stated, inside = trajectory_error(found(e, "kinematic"), e)
+        share.append(inside)
+        ratio.append((after / stated) ** 2)
+    assert 0.88 < np.mean(share) < 0.99
+    assert 0.4 < np.mean(ratio) < 1.8
+
+
+@pytest.mark.parametrize("kind", ["paper", "mixed"])
+def test_a_perfect_machine_stays_rigid(kind: str) -> None:
+    e = hexapod_experiment(HEXAPOD, kind, 1, size=0.0)
+    rigid = rigid_of(e)
+    cal = found(e)
+    assert cal.model == "rigid"
+    np.testing.assert_array_equal(cal.T_HT.matrix, rigid.T_HT.matrix)
+    assert trajectory_error(cal, e)[0] < 0.006
+    models = {m["model"]: m for m in cal.extra["models"]}
+    assert models["kinematic"]["log_evidence"] < models["rigid"]["log_evidence"] + EVIDENCE_GAIN
+
+
+def test_small_errors_get_a_small_prior() -> None:
+    """A machine fifty times better than its file says: the errors' size is taken from the data."""
+    e = hexapod_experiment(HEXAPOD, "mixed", 0, size=0.02)
+    rigid, cal = rigid_of(e), found(e)
+    assert cal.model == "kinematic"
+    assert trajectory_error(cal, e)[0] < 0.5 * trajectory_error(rigid, e)[0]
+    assert {m["model"]: m["size"] for m in cal.extra["models"]}["kinematic"] < 0.1
+
+
+@pytest.mark.parametrize("kind", ["paper", "mixed"])
+@pytest.mark.parametrize("worn", [{"backlash_mm": 0.003}, {"leg_backlash_mm": 0.003}])
+def test_backlash_and_drift_do_not_ruin_it(kind: str, worn: dict[str, float]) -> None:
+    disturbance = Disturbance(growth_mm=(0.001, -0.002, 0.004), growth_rad=(5e-6, -8e-6, 4e-6), **worn)
+    e = hexapod_experiment(HEXAPOD, kind, 2, disturbance=disturbance)
+    cal = found(e)
+    after, stated, inside = trajectory_error(cal, e)
+    assert after < 0.08
+    assert after < 2.5 * stated
+    assert inside > 0.6
+    assert any("lag_" in name for name in cal.tangent)
+    assert not any("lag_" in name for name in cal.manipulator["names"]), "a run's lag is no property of the machine"
+    assert any("drifted" in reason for reason in cal.reasons)
+
+
+def test_robot_on_the_table() -> None:
+    e = robot_experiment(ROBOT, 1, table=True)
+    assert trajectory_error(found(e), e)[0] < trajectory_error(rigid_of(e), e)[0] / 20
+
+
+def test_robot_alone_needs_one_known_length() -> None:
+    """All of a robot's lengths with the ball and the distance to the source can grow together; a scale bar stops it."""
+    e = robot_experiment(ROBOT, 1, balls=2)
+    length = float(np.linalg.norm(ROBOT_BALLS[0] - ROBOT_BALLS[1]))
+    without = found(e)
+    bar = found(e, distances={(0, 1): (length, 0.0005)})
+    assert trajectory_error(bar, e)[0] < trajectory_error(rigid_of(e), e)[0] / 20
+    assert trajectory_error(bar, e)[1] < 0.1 * trajectory_error(without, e)[1]
+    assert abs(np.linalg.norm(bar.balls[0] - bar.balls[1]) - length) < 0.002
+
+
+def test_cartesian_log_of_a_robot_gives_the_same() -> None:
+    e = robot_experiment(ROBOT, 0, n=60, table=True)
+    cartesian = replace(e.poses, q=None)
+    a, b = found(e, "kinematic"), found(e, "kinematic", poses=cartesian)
+    np.testing.assert_allclose(a.manipulator["values"], b.manipulator["values"], atol=1e-6)
+
+
+def test_gross_errors_are_set_aside() -> None:
+    e = hexapod_experiment(HEXAPOD, "mixed", 0)
+    x = e.observations.x_D.copy()
+    x[[5, 50, 100]] += [[3, 1], [0.3, -0.3], [-40, 50]]
+    cal = found(e, observations=replace(e.observations, x_D=x))
+    assert set(cal.outliers) == {"5", "50", "100"}
+    assert len(cal.pose_id) == 186
+    assert trajectory_error(cal, e)[0] < 0.03
+
+
+def test_exchanged_balls_are_named() -> None:
+    e = hexapod_experiment(HEXAPOD, "mixed", 0, balls=2)
+    ball = np.array(e.poses.ball_id)
+    ball[[10, 11]] = ball[[11, 10]]
+    with pytest.raises(InputError, match="pose '10' is said to show ball 1 and shows ball 0"):
+        found(e, poses=replace(e.poses, ball_id=ball))
+
+
+def test_machine_may_come_as_model_document_or_file(tmp_path: Any) -> None:
+    from tomopose.manipulator.files import write_manipulator
+
+    write_manipulator(tmp_path / "hexapod.json", HEXAPOD)
+    for given in (HEXAPOD, tmp_path / "hexapod.json", str(tmp_path / "hexapod.json"), HEXAPOD.to_json()):
+        machine = machine_of(given)
+        assert machine is not None
+        np.testing.assert_allclose(machine.sigma, HEXAPOD.sigma)
+    with pytest.raises(InputError, match="manipulator is int"):
+        machine_of(42)
+
+
+def test_wrong_calls_are_refused() -> None:
+    e = hexapod_experiment(HEXAPOD, "mixed", 0, balls=2)
+    rigid = rigid_of(e)
+    for options, message in (
+        ({"model": "magic"}, "unknown model"),
+        ({"model": "kinematic"}, "needs the manipulator"),
+        ({"model": "auto", "manipulator": HEXAPOD, "distances": {(0, 7): (20.0, 0.1)}}, "observed are balls"),
+        ({"model": "auto", "manipulator": HEXAPOD, "distances": {(0, 1): (-20.0, 0.1)}}, "two numbers > 0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            calibrate_kinematic(e.scanner, e.poses, e.observations, rigid=rigid, **options)
+
+
+def test_result_survives_its_file(tmp_path: Any) -> None:
+    e = hexapod_experiment(HEXAPOD, "mixed", 0)
+    cal = found(e)
+    write_calibration(tmp_path / "calibration.json", cal)
+    again = read_calibration(tmp_path / "calibration.json")
+    np.testing.assert_array_equal(
+        corrected_poses(again.manipulator, e.scan).T_MH.matrix, corrected_poses(cal.manipulator, e.scan).T_MH.matrix
+    )
+    assert trajectory_error(again, e) == trajectory_error(cal, e)
+
+
+def test_deterministic_and_independent_of_row_order() -> None:
+    e = hexapod_experiment(HEXAPOD, "mixed", 0)
+    order = np.random.default_rng(1).permutation(len(e.observations))
+    shuffled: BallObservations = e.observations.select(order)
+    a, b, c = found(e), found(e), found(e, observations=shuffled)
+    assert a.manipulator == b.manipulator
+    np.testing.assert_array_equal(a.manipulator["values"], c.manipulator["values"])
+
+
+def test_residuals_by_axis_before_and_after() -> None:
+    """Fig. 8 (b): tilts ten times worse than the rest, and after the correction all alike."""
+    cal = found(hexapod_experiment(HEXAPOD, "paper", 0))
+    rows = {row["rotation"]: row for row in cal.extra["by_rotation"]}
+    assert set(rows) == {"none", "+x", "-x", "+y", "-y", "+z", "-z"}
+    assert all(row["n"] == 27 for row in rows.values())
+    worst = max(row["rigid_px"] for row in rows.values())
+    assert worst > 3 * min(row["rigid_px"] for row in rows.values())
+    assert max(row["kinematic_px"] for row in rows.values()) < 0.04
+    assert rows["+x"]["rigid_um"] == pytest.approx(rows["+x"]["rigid_px"] * 200 / cal.scanner.magnification)
+
+
+def test_freed_scanner_parameters_are_solved_along() -> None:
+    e = hexapod_experiment(HEXAPOD, "mixed", 4)
+    off = replace(e.scanner, u_0=e.scanner.u_0 + 0.8, d_SR=e.scanner.d_SR + 0.05, sigma={"u_0": 1.0, "d_SR": 0.1})
+    rigid = calibrate(off, e.poses, e.observations, model="rigid", hypotheses=False)
+    cal = calibrate_kinematic(off, e.poses, e.observations, rigid=rigid, manipulator=HEXAPOD, model="kinematic")
+    u = {p.name: p.u for p in cal.parameters}
+    assert abs(cal.scanner.u_0 - e.scanner.u_0) < 4 * u["u_0"] < 0.2
+    assert abs(cal.scanner.d_SR - e.scanner.d_SR) < 4 * u["d_SR"] < 0.1
