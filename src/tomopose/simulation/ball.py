@@ -15,9 +15,16 @@ from tomopose.simulation.shapes import Solid, cylinder, sphere
 from tomopose.units import Array
 
 
-def ball_in_holder(*, t: Any, ball_diameter: float = 8.0, axis: Any = (0.0, 0.0, 1.0), tube_diameter: float | None = None,
-                   tube_length: float = 15.0, extension_diameter: float = 16.0, extension_length: float = 60.0,
-                   ) -> tuple[Solid, ...]:
+def ball_in_holder(
+    *,
+    t: Any,
+    ball_diameter: float = 8.0,
+    axis: Any = (0.0, 0.0, 1.0),
+    tube_diameter: float | None = None,
+    tube_length: float = 15.0,
+    extension_diameter: float = 16.0,
+    extension_length: float = 60.0,
+) -> tuple[Solid, ...]:
     """Ball of WC-Co at t (3,) mm in M, its lower half in a PEEK tube whose rim lies at the ball's equator.
 
     axis: the tube's direction in M, towards the ball; lengths and diameters in mm.  The tube's bore has the ball's
@@ -37,8 +44,8 @@ def ball_in_holder(*, t: Any, ball_diameter: float = 8.0, axis: Any = (0.0, 0.0,
 def silhouette_centre(scanner: Scanner, x_S: Any, radius: float) -> Array:
     r"""Centre (n, 2), px, of the ellipse that balls at x_S (n, 3) in S cast: not the projected ball centre.
 
-    The silhouette is the cone x' (c c' - (c.c - r^2) 1) x = 0; with x = K^-1 (u, v, 1)' it is a conic Q of the panel, and
-    the ellipse's centre solves Q_11 m = -Q_12.
+    The silhouette is the cone x' (c c' - (c.c - r^2) 1) x = 0; with x = K^-1 (u, v, 1)' it is a conic Q of the
+    panel, and the ellipse's centre solves Q_11 m = -Q_12.
     """
     c = np.atleast_2d(np.asarray(x_S, dtype=np.float64))
     beyond = np.einsum("ni,ni->n", c, c) - radius**2

@@ -51,12 +51,22 @@ def simulate(scene: S.Scene, *, poses: PoseSequence | None = None) -> SimulatedR
     set_poses = _poses(scene) if poses is None else poses
     recorded, real = _manipulate(scene, set_poses)
     return SimulatedRun(
-        scanner=scanner, poses=recorded, T_HT=T_HT, T_MH=real, solids=solids, meshes=meshes, materials=materials,
-        spectrum=_spectrum(scene, materials), detector=_detector(scene.detector), seed=scene.seed,
+        scanner=scanner,
+        poses=recorded,
+        T_HT=T_HT,
+        T_MH=real,
+        solids=solids,
+        meshes=meshes,
+        materials=materials,
+        spectrum=_spectrum(scene, materials),
+        detector=_detector(scene.detector),
+        seed=scene.seed,
         spot=FocalSpot(**_without_units(scene.source.spot)),
-        motion=Motion(alpha=float(np.radians(scene.motion.alpha_deg)), shift=scene.motion.shift_mm,
-                      points=scene.motion.points),
-        t=None if ball is None else ball.t_mm, ball_diameter=None if ball is None else ball.diameter_mm,
+        motion=Motion(
+            alpha=float(np.radians(scene.motion.alpha_deg)), shift=scene.motion.shift_mm, points=scene.motion.points
+        ),
+        t=None if ball is None else np.array(ball.t_mm),
+        ball_diameter=None if ball is None else ball.diameter_mm,
         engine=scene.engine,
     )
 
@@ -65,7 +75,8 @@ def _without_units(part: S.Part) -> dict[str, Any]:
     """A part's values by their names inside: `size_u_mm` becomes `size_u`."""
     units = ("_mm", "_px", "_rad")
     return {
-        next((key.removesuffix(u) for u in units if key.endswith(u)), key): value for key, value in part.model_dump().items()
+        next((key.removesuffix(u) for u in units if key.endswith(u)), key): value
+        for key, value in part.model_dump().items()
     }
 
 
@@ -136,7 +147,9 @@ def _detector(part: S.DetectorPart) -> Detector:
     return Detector(**{**values, "mtf": mtf, "scatter": scatter, "glare": glare})
 
 
-def _objects(scene: S.Scene, materials: Mapping[str, Material]) -> tuple[tuple[Solid, ...], tuple[Any, ...], S.BallPart | None]:
+def _objects(
+    scene: S.Scene, materials: Mapping[str, Material]
+) -> tuple[tuple[Solid, ...], tuple[Any, ...], S.BallPart | None]:
     from tomopose.simulation.mesh import MeshSolid, read_mesh
     from tomopose.simulation.specimen import specimen_mesh
     from tomopose.simulation.standard import multi_sphere_standard
@@ -152,15 +165,24 @@ def _objects(scene: S.Scene, materials: Mapping[str, Material]) -> tuple[tuple[S
                 raise InputError(f"the ball is fixed to frame {part.frame}; it moves with the manipulator (M)")
             ball = part
             made = ball_in_holder(
-                t=part.t_mm, ball_diameter=part.diameter_mm, axis=part.holder_axis, tube_diameter=part.tube_diameter_mm,
-                tube_length=part.tube_length_mm, extension_diameter=part.extension_diameter_mm,
+                t=part.t_mm,
+                ball_diameter=part.diameter_mm,
+                axis=part.holder_axis,
+                tube_diameter=part.tube_diameter_mm,
+                tube_length=part.tube_length_mm,
+                extension_diameter=part.extension_diameter_mm,
                 extension_length=part.extension_length_mm,
             )
-            solids += [replace(made[-1], material=part.material)] if not part.holder else [
-                *made[:-1], replace(made[-1], material=part.material)]
+            solids += (
+                [replace(made[-1], material=part.material)]
+                if not part.holder
+                else [*made[:-1], replace(made[-1], material=part.material)]
+            )
         elif isinstance(part, S.StandardPart):
-            solids += [replace(s, shape=s.shape.placed(**where), frame=frame)
-                       for s in multi_sphere_standard(shafts=part.shafts, base=part.base)]
+            solids += [
+                replace(s, shape=s.shape.placed(**where), frame=frame)
+                for s in multi_sphere_standard(shafts=part.shafts, base=part.base)
+            ]
         elif isinstance(part, S.SpecimenPart):
             mesh = specimen_mesh(deviations=part.deviations, seed=scene.seed)
             meshes.append(MeshSolid(mesh=mesh.placed(**where), material=part.material, frame=frame, name=part.name))
@@ -168,11 +190,12 @@ def _objects(scene: S.Scene, materials: Mapping[str, Material]) -> tuple[tuple[S
             mesh = read_mesh(Path(scene.folder) / part.file, scale=part.scale)
             meshes.append(MeshSolid(mesh=mesh.placed(**where), material=part.material, frame=frame, name=part.name))
         else:
-            solids.append(Solid(shape=_shape(part.shapes).placed(**where), material=part.material, frame=frame,
-                                name=part.name))
-    for solid in (*solids, *meshes):
-        if solid.material not in materials:
-            raise InputError(f"material {solid.material!r} is unknown; known are {', '.join(sorted(materials))}")
+            solids.append(
+                Solid(shape=_shape(part.shapes).placed(**where), material=part.material, frame=frame, name=part.name)
+            )
+    for name in [s.material for s in solids] + [m.material for m in meshes]:
+        if name not in materials:
+            raise InputError(f"material {name!r} is unknown; known are {', '.join(sorted(materials))}")
     return tuple(solids), tuple(meshes), ball
 
 
@@ -182,7 +205,7 @@ def _shape(parts: tuple[S.ShapePart, ...]) -> Shape:
         new = _primitive(part).along(part.axis, t=part.t_mm)
         if shape is None:
             if part.do != "add":
-                raise InputError(f"the first shape of a solid cannot {part.do}; it begins with do = \"add\"")
+                raise InputError(f'the first shape of a solid cannot {part.do}; it begins with do = "add"')
             shape = new
         else:
             shape = shape | new if part.do == "add" else (shape - new if part.do == "subtract" else shape & new)
@@ -217,8 +240,12 @@ def _poses(scene: S.Scene) -> PoseSequence:
 
     part = scene.poses
     if part.grid is not None:
-        return pose_grid(part.grid.n, half_range=part.grid.half_range_mm, tilt=float(np.radians(part.grid.tilt_deg)),
-                         table_angles=np.radians(part.grid.table_angles_deg).tolist())
+        return pose_grid(
+            part.grid.n,
+            half_range=part.grid.half_range_mm,
+            tilt=float(np.radians(part.grid.tilt_deg)),
+            table_angles=np.radians(part.grid.table_angles_deg).tolist(),
+        )
     if part.scan is not None:
         if part.scan.tilt == "none":
             return circular_scan(part.scan.n)

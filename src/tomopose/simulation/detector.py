@@ -1,15 +1,15 @@
 """The detector: from the noiseless image to grey values.
 
-    quanta     q = Poisson(q_0 profile signal), spread over neighbours by the scintillator (noise correlation)
-    raw        g = dark + gain q + readout noise, held between 0 and saturation, rounded to `bits`
-    corrected  c = white (g - dark) / (flat - dark), with averaged dark and flat images that have their own noise
+quanta     q = Poisson(q_0 profile signal), spread over neighbours by the scintillator (noise correlation)
+raw        g = dark + gain q + readout noise, held between 0 and saturation, rounded to `bits`
+corrected  c = white (g - dark) / (flat - dark), with averaged dark and flat images that have their own noise
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -62,8 +62,8 @@ class Detector:
     flats: int = 50
     falloff: bool = False
     lag: tuple[float, ...] = ()
-    scatter: Scatter = Scatter()
-    glare: Glare = Glare()
+    scatter: Scatter = field(default_factory=Scatter)
+    glare: Glare = field(default_factory=Glare)
     cells: int = 2
 
     def __post_init__(self) -> None:
@@ -144,7 +144,9 @@ def fixed_pattern(detector: Detector, shape: tuple[int, int], seed: int) -> tupl
 def _raw(signal: Array, detector: Detector, *, seed: int, frame: int, stream: int, threads: int) -> Array:
     """Grey values before rounding: quanta, their spread, gain, dark, readout noise."""
     n_v = signal.shape[0]
-    gain, dark, _ = fixed_pattern(detector, signal.shape, seed) if detector.patterned or detector.dead_share else (1, 0, 0)
+    gain, dark, _ = (
+        fixed_pattern(detector, signal.shape, seed) if detector.patterned or detector.dead_share else (1, 0, 0)
+    )
     if math.isinf(detector.snr):
         quanta = signal
         scale = detector.white
@@ -155,7 +157,9 @@ def _raw(signal: Array, detector: Detector, *, seed: int, frame: int, stream: in
         scale = detector.white / detector.quanta
         if detector.noise_sigma > 0:
             deviation, k = quanta - mean, detector.noise_kernel
-            quanta = mean + ndimage.correlate1d(ndimage.correlate1d(deviation, k, 0, mode="mirror"), k, 1, mode="mirror")
+            quanta = mean + ndimage.correlate1d(
+                ndimage.correlate1d(deviation, k, 0, mode="mirror"), k, 1, mode="mirror"
+            )
     raw = dark + gain * (scale * quanta)
     if detector.readout_noise > 0:
         sigma, key = detector.readout_noise / math.sqrt(detector.averages), frame_key(seed, frame, stream + 8)

@@ -25,8 +25,8 @@ class Scatter:
     def __post_init__(self) -> None:
         if not (0 <= self.constant < 1 and 0 <= self.amount < 10 and self.sigma > 0):
             raise InputError(
-                f"scatter: constant {self.constant}, amount {self.amount}, sigma {self.sigma} px; constant lies in [0, 1), "
-                "amount in [0, 10), sigma above 0"
+                f"scatter: constant {self.constant} lies in [0, 1), amount {self.amount} in [0, 10), "
+                f"sigma {self.sigma} px above 0"
             )
 
 

@@ -32,8 +32,9 @@ def _engine() -> Any:
     try:
         from gvxrPython3 import gvxr
     except ImportError as error:
-        raise EngineMissingError('engine = "gvxr" needs gvxr, which is not installed', install_line="pip install gvxr"
-                                 ) from error
+        raise EngineMissingError(
+            'engine = "gvxr" needs gvxr, which is not installed', install_line="pip install gvxr"
+        ) from error
     try:
         gvxr.createWindow(-1, 0, "EGL")
         gvxr.usePointSource()
@@ -46,14 +47,20 @@ def _engine() -> Any:
     return gvxr
 
 
-def path_images(bodies: list[tuple[Any, Any]], view: View, u_0: float, v_0: float, step: float, n_u: int, n_v: int) -> Array:
+def path_images(
+    bodies: list[tuple[Any, Any]], view: View, u_0: float, v_0: float, step: float, n_u: int, n_v: int
+) -> Array:
     """(m, n_v, n_u) path lengths, mm, through m meshes (vertices in W, faces) at u_0 + step i, v_0 + step j (px)."""
     gvxr = _engine()
     gvxr.removePolygonMeshesFromSceneGraph()
     for k, (vertices, faces) in enumerate(bodies):
         name = f"body {k}"
-        gvxr.makeTriangularMesh(name, np.ascontiguousarray(vertices, dtype=np.float32).ravel(),
-                                np.ascontiguousarray(faces, dtype=np.int32).ravel(), "mm")
+        gvxr.makeTriangularMesh(
+            name,
+            np.ascontiguousarray(vertices, dtype=np.float32).ravel(),
+            np.ascontiguousarray(faces, dtype=np.int32).ravel(),
+            "mm",
+        )
         gvxr.addPolygonMeshAsInnerSurface(name)
         gvxr.setElement(name, "Al")
         gvxr.setDensity(name, 2.7, "g/cm3")
@@ -76,7 +83,13 @@ def path_images(bodies: list[tuple[Any, Any]], view: View, u_0: float, v_0: floa
 
 
 def add_gvxr_transmission(
-    out: Array, window: Window, run: SimulatedRun, view: View, T_FW: dict[Frame, RigidTransform], *, f: int,
+    out: Any,
+    window: Window,
+    run: SimulatedRun,
+    view: View,
+    T_FW: dict[Frame, RigidTransform],
+    *,
+    f: int,
     weight: float = 1.0,
 ) -> None:
     """Add weight x transmission at the middle of each cell to out[0]; see `projector.add_transmission`."""

@@ -1,7 +1,7 @@
 """Materials: what a solid is made of, and its linear attenuation coefficient.
 
-The elements of common parts and detectors come with the package (data/attenuation.csv); any other element is looked up in
-xraydb.  Both are the tables of Elam, Ravel and Sieber (Radiat. Phys. Chem. 63 (2002) 121).
+The elements of common parts and detectors come with the package (data/attenuation.csv); any other element is looked
+up in xraydb.  Both are the tables of Elam, Ravel and Sieber (Radiat. Phys. Chem. 63 (2002) 121).
 """
 
 from __future__ import annotations
@@ -23,8 +23,23 @@ CM2_PER_G_TO_MM = 0.1
 """cm2/g times g/cm3 is 1/cm; this makes it 1/mm."""
 
 ATOMIC_WEIGHT = MappingProxyType(
-    {"H": 1.008, "C": 12.011, "N": 14.007, "O": 15.999, "Mg": 24.305, "Al": 26.982, "Si": 28.085, "Mn": 54.938,
-     "Fe": 55.845, "Co": 58.933, "Ni": 58.693, "Cu": 63.546, "Cs": 132.905, "I": 126.904, "W": 183.84}
+    {
+        "H": 1.008,
+        "C": 12.011,
+        "N": 14.007,
+        "O": 15.999,
+        "Mg": 24.305,
+        "Al": 26.982,
+        "Si": 28.085,
+        "Mn": 54.938,
+        "Fe": 55.845,
+        "Co": 58.933,
+        "Ni": 58.693,
+        "Cu": 63.546,
+        "Cs": 132.905,
+        "I": 126.904,
+        "W": 183.84,
+    }
 )
 """Standard atomic weights (IUPAC 2021) of the elements in the package's table."""
 

@@ -1,8 +1,9 @@
 """Triangle meshes: path lengths through closed surfaces, by embreex with every hit computed again in float64.
 
-Embree finds which triangles a ray meets, in float32; where it meets them is computed here from the triangle's plane.  The
-signs of entries and exits must cancel along each ray; a ray where they do not has slipped through a shared edge and is
-shot again a millionth of the mesh's radius beside itself, for it would give a path as long as the object.
+Embree finds which triangles a ray meets, in float32; where it meets them is computed here from the triangle's
+plane.  The signs of entries and exits must cancel along each ray; a ray where they do not has slipped through a
+shared edge and is shot again a millionth of the mesh's radius beside itself, for it would give a path as long as
+the object.
 """
 
 from __future__ import annotations
@@ -81,7 +82,8 @@ class Mesh:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MeshSolid:
-    """A closed mesh filled with a material and fixed to a frame: M, H, T or W.  Meshes must not overlap other solids."""
+    """A closed mesh filled with a material and fixed to a frame: M, H, T or W.  Meshes must not overlap other
+    solids."""
 
     mesh: Mesh
     material: str
@@ -106,7 +108,7 @@ class MeshSolid:
     def tracer(self) -> Tracer:
         if "tracer" not in self._cache:
             self._cache["tracer"] = Tracer(self.mesh)
-        return self._cache["tracer"]  # type: ignore[no-any-return]
+        return self._cache["tracer"]
 
 
 def _mesh_solid(mesh: Mesh, material: str, frame: Frame, name: str) -> MeshSolid:
@@ -147,15 +149,16 @@ class Tracer:
         for attempt in range(1, RETRIES + 1):
             if not len(again):
                 return L, hits
-            jitter = np.random.default_rng(np.random.SeedSequence([attempt, len(again)])).standard_normal((len(again), 3))
+            jitter = np.random.default_rng(np.random.SeedSequence([attempt, len(again)])).standard_normal(
+                (len(again), 3)
+            )
             moved = start[again] + 1e-6 * 1.3**attempt * self.radius * jitter
             first = np.maximum(-self.radius - 1.0, -along[again])
             L[again], hits[again], parity = self._shoot(moved, d[again], first)
             again = again[parity != 0]
         if len(again):
             raise EngineFailedError(
-                f"{len(again)} rays through the mesh enter and leave a different number of times; the mesh has a hole or "
-                "crosses itself"
+                f"{len(again)} rays enter and leave the mesh unequally often; it has a hole or crosses itself"
             )
         return L, hits
 
@@ -177,8 +180,9 @@ class Tracer:
             with np.errstate(divide="ignore", invalid="ignore"):
                 t = (self.offset[face] - np.einsum("ij,ij->i", self.normal[face], o[live])) / slope
             # A ray within the triangle's plane has no crossing of its own: float32's place stands.
-            t = np.where(np.isfinite(t) & (np.abs(t - begin[live] - reach) < 0.01 + 1e-3 * np.abs(reach)), t,
-                         begin[live] + reach)
+            t = np.where(
+                np.isfinite(t) & (np.abs(t - begin[live] - reach) < 0.01 + 1e-3 * np.abs(reach)), t, begin[live] + reach
+            )
             new = face != last[live]
             sign = np.sign(slope).astype(np.int64)
             L[live] += np.where(new, sign * t, 0.0)
@@ -203,7 +207,7 @@ def _load(path: str, scale: float) -> Mesh:
     except ImportError as error:
         raise EngineMissingError("mesh files need trimesh, which is not installed", install_line=INSTALL) from error
     try:
-        loaded = trimesh.load(path, force="mesh", process=True)
+        loaded: Any = trimesh.load(path, force="mesh", process=True)
     except Exception as error:
         raise FileError(f"{path} cannot be read as a mesh: {error}", path=path) from error
     return Mesh(vertices=np.asarray(loaded.vertices) * scale, faces=np.asarray(loaded.faces)).require_closed()

@@ -20,8 +20,18 @@ MOST_RAYS = 400_000
 
 
 def add_mesh_transmission(
-    out: Array, window: Window, compiled: Compiled | None, meshes: tuple[MeshSolid, ...], materials: tuple[str, ...],
-    beam: Beam, view: View, T_FW: dict[Frame, RigidTransform], *, f: int, weight: float = 1.0, threads: int = 1,
+    out: Any,
+    window: Window,
+    compiled: Compiled | None,
+    meshes: tuple[MeshSolid, ...],
+    materials: tuple[str, ...],
+    beam: Beam,
+    view: View,
+    T_FW: dict[Frame, RigidTransform],
+    *,
+    f: int,
+    weight: float = 1.0,
+    threads: int = 1,
 ) -> None:
     """Add weight x transmission of meshes and solids to `out`, cells as `projector.add_transmission` describes them.
 
@@ -49,10 +59,11 @@ def add_mesh_transmission(
     I, seen = np.ones((n_v + 1, n_u + 1)), np.zeros((n_v + 1, n_u + 1), dtype=np.int64)
     rows = max(1, MOST_RAYS // (n_u + 1))
     u = window.u_0 + np.arange(n_u + 1) - 0.5
-    for j in range(0, n_v + 1, rows):
-        v = window.v_0 + np.arange(j, min(j + rows, n_v + 1)) - 0.5
+    for start in range(0, n_v + 1, rows):
+        v = window.v_0 + np.arange(start, min(start + rows, n_v + 1)) - 0.5
         T, s = at(np.tile(u, len(v)), np.repeat(v, n_u + 1))
-        I[j : j + len(v)], seen[j : j + len(v)] = T.reshape(len(v), -1), s.reshape(len(v), -1)
+        band = slice(start, start + len(v))
+        I[band], seen[band] = T.reshape(len(v), -1), s.reshape(len(v), -1)
     rough = np.empty((n_v, n_u), dtype=np.bool_)
     in_bands(lambda lo, hi: fill_smooth(I, seen, f, lo, hi, weight, out, rough), n_v, threads)
     q = np.arange(POINTS)

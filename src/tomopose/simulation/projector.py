@@ -1,12 +1,12 @@
 """The ideal detector image: transmission averaged over each pixel, exact at edges, cheap elsewhere.
 
 Rays go through the pixels' corners.  Where a pixel and its neighbours see the same surfaces and the transmission is
-smooth, its mean follows from the corners (bilinear with the curvature's correction).  Everywhere else the pixel is cut in
-f x f cells; a cell with a faint edge is sampled at the points of a Fibonacci lattice, which no straight edge can follow, and
-a cell with a steep edge is cut along it.
-The result has f x f cells a pixel, so that blur acts before the pixel integrates, as it does in a scintillator; and each
-cell holds four numbers (mean, slope along u, slope along v, twist: the bilinear surface nearest to the transmission), so
-that an edge keeps its place inside its cell.
+smooth, its mean follows from the corners (bilinear with the curvature's correction).  Everywhere else the pixel is
+cut in f x f cells; a cell with a faint edge is sampled at the points of a Fibonacci lattice, which no straight edge
+can follow, and a cell with a steep edge is cut along it.
+The result has f x f cells a pixel, so that blur acts before the pixel integrates, as it does in a scintillator; and
+each cell holds four numbers (mean, slope along u, slope along v, twist: the bilinear surface nearest to the
+transmission), so that an edge keeps its place inside its cell.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from tomopose.units import Array
 LATTICES = ((5, 3), (13, 8), (21, 13))
 """Fibonacci lattices (n, k) of a cell: points (i / n, k i / n mod 1), placed symmetrically about its middle."""
 FLAT = 2e-3
-"""Differences of transmission over a cell below this need no lattice; above 4, 16 times as much a finer one; above 32 times
-an edge is cut exactly."""
+"""Differences of transmission over a cell below this need no lattice; above 4, 16 times as much a finer one; above
+32 times an edge is cut exactly."""
 LINES, HALVINGS = 6, 9
 GAUSS = np.stack([(np.polynomial.legendre.leggauss(4)[0] + 1) / 2, np.polynomial.legendre.leggauss(4)[1] / 2], axis=1)
 OPAQUE = 30.0
@@ -56,8 +56,9 @@ class View:
         """The scanner's view; source_shift (3,) mm moves the source in S against the panel (focal spot)."""
         U, V, O = scanner.panel
         T_SW = scanner.T_WS.inv
-        return cls(source=T_SW.apply(np.asarray(source_shift, dtype=np.float64)), O=T_SW.apply(O), U=T_SW.R @ U,
-                   V=T_SW.R @ V)
+        return cls(
+            source=T_SW.apply(np.asarray(source_shift, dtype=np.float64)), O=T_SW.apply(O), U=T_SW.R @ U, V=T_SW.R @ V
+        )
 
     def project(self, x: Array) -> Array:
         """Pixels (m, 2) of points (m, 3) of W; OutOfViewError where one lies behind the source."""
@@ -82,8 +83,12 @@ def in_bands(work: Callable[[int, int], None], n: int, threads: int) -> None:
 def _work_space(c: Any, depth: int) -> Any:
     """(T, S, L, active) for `trace`: each band of rows has its own."""
     mu, boxes = c[10], c[15]
-    return (np.empty((depth + 3, LARGEST)), np.empty((depth + 3, LARGEST + 1), dtype=np.int64), np.empty(mu.shape[1]),
-            np.empty(len(boxes), dtype=np.bool_))
+    return (
+        np.empty((depth + 3, LARGEST)),
+        np.empty((depth + 3, LARGEST + 1), dtype=np.int64),
+        np.empty(mu.shape[1]),
+        np.empty(len(boxes), dtype=np.bool_),
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -97,11 +102,15 @@ def _at(c: Any, work: Any, u: float, v: float) -> Any:
         nothing = nothing and not active[k]
     if nothing:
         return 1.0, np.int64(0)
-    dx, dy, dz = (O[0] + u * U[0] + v * V[0] - s[0], O[1] + u * U[1] + v * V[1] - s[1],
-                  O[2] + u * U[2] + v * V[2] - s[2])
+    dx, dy, dz = (
+        O[0] + u * U[0] + v * V[0] - s[0],
+        O[1] + u * U[1] + v * V[1] - s[1],
+        O[2] + u * U[2] + v * V[2] - s[2],
+    )
     h = 1 / np.sqrt(dx * dx + dy * dy + dz * dz)
-    signature = trace(kind, p, R, t, ops, first, material, centre, radius, active, s[0], s[1], s[2], h * dx, h * dy,
-                      h * dz, T, S, L)
+    signature = trace(
+        kind, p, R, t, ops, first, material, centre, radius, active, s[0], s[1], s[2], h * dx, h * dy, h * dz, T, S, L
+    )
     if signature == 0:
         return 1.0, signature
     total = 0.0
@@ -164,8 +173,8 @@ def _add(out: Any, row: int, column: int, m: float, m_u: float, m_v: float, m_uv
 def _split_cell(c: Any, work: Any, left: float, low: float, h: float, along_u: bool) -> Any:
     """Moments (m, m_u, m_v, m_uv about the middle, side 1) of a cell that a steep edge crosses.
 
-    On each of LINES lines across the edge its place is found by halving, and both sides are integrated by Gauss's rule in
-    the root of the distance from the edge, where the transmission behind a round rim is smooth.
+    On each of LINES lines across the edge its place is found by halving, and both sides are integrated by Gauss's
+    rule in the root of the distance from the edge, where the transmission behind a round rim is smooth.
     """
     m = m_u = m_v = m_uv = 0.0
     for q in range(LINES):
@@ -225,13 +234,32 @@ def fill_smooth(I: Any, seen: Any, f: int, j_0: int, j_1: int, weight: float, ou
                     x = (b + 0.5) * h
                     I_u, I_v = f_01 - f_00 + y * twist, f_10 - f_00 + x * twist
                     value = f_00 + x * (f_01 - f_00) + y * I_v - bow[b] * I_uu - bow[a] * I_vv
-                    _add(out, j * f + a, i * f + b, weight * value, weight * (I_u + (x - 0.5) * I_uu),
-                         weight * (I_v + (y - 0.5) * I_vv), weight * twist)
+                    _add(
+                        out,
+                        j * f + a,
+                        i * f + b,
+                        weight * value,
+                        weight * (I_u + (x - 0.5) * I_uu),
+                        weight * (I_v + (y - 0.5) * I_vv),
+                        weight * twist,
+                    )
 
 
 @njit(cache=True, nogil=True)
-def _cells(c: Any, depth: int, u_0: int, v_0: int, I: Any, seen: Any, f: int, j_0: int, j_1: int, weight: float, out: Any,
-           rough: Any) -> None:
+def _cells(
+    c: Any,
+    depth: int,
+    u_0: int,
+    v_0: int,
+    I: Any,
+    seen: Any,
+    f: int,
+    j_0: int,
+    j_1: int,
+    weight: float,
+    out: Any,
+    rough: Any,
+) -> None:
     """Add weight x moments of the f x f cells of the pixels in rows j_0 to j_1 to `out` (4, rows, columns)."""
     work = _work_space(c, depth)
     node, node_seen = np.empty((f + 1, f + 1)), np.empty((f + 1, f + 1), dtype=np.int64)
@@ -252,7 +280,9 @@ def _cells(c: Any, depth: int, u_0: int, v_0: int, I: Any, seen: Any, f: int, j_
                 for b in range(f):
                     f_00, f_01, f_10, f_11 = node[a, b], node[a, b + 1], node[a + 1, b], node[a + 1, b + 1]
                     mark = node_seen[a, b]
-                    same = mark == node_seen[a + 1, b] and mark == node_seen[a, b + 1] and mark == node_seen[a + 1, b + 1]
+                    same = (
+                        mark == node_seen[a + 1, b] and mark == node_seen[a, b + 1] and mark == node_seen[a + 1, b + 1]
+                    )
                     if same and mark == 0:
                         out[0, j * f + a, i * f + b] += weight
                         continue
@@ -260,9 +290,15 @@ def _cells(c: Any, depth: int, u_0: int, v_0: int, I: Any, seen: Any, f: int, j_
                     middle, _ = _at(c, work, left + (b + 0.5) * h, low + (a + 0.5) * h)
                     span = max(f_00, f_01, f_10, f_11, middle) - min(f_00, f_01, f_10, f_11, middle)
                     if span < FLAT or (same and abs(middle - corners) < FLAT):
-                        _add(out, j * f + a, i * f + b, weight * (2 * middle + corners) / 3,
-                             weight * f * (f_01 + f_11 - f_00 - f_10) / 2, weight * f * (f_10 + f_11 - f_00 - f_01) / 2,
-                             weight * f * f * (f_11 - f_10 - f_01 + f_00))
+                        _add(
+                            out,
+                            j * f + a,
+                            i * f + b,
+                            weight * (2 * middle + corners) / 3,
+                            weight * f * (f_01 + f_11 - f_00 - f_10) / 2,
+                            weight * f * (f_10 + f_11 - f_00 - f_01) / 2,
+                            weight * f * f * (f_11 - f_10 - f_01 + f_00),
+                        )
                         continue
                     if not same and span > 32 * FLAT:
                         across = abs(f_01 + f_11 - f_00 - f_10) > abs(f_10 + f_11 - f_00 - f_01)
@@ -295,9 +331,15 @@ class Window:
     n_v: int
 
 
-def shadow(outlines: list[tuple[Frame, Array]], view: View, T_FW: dict[Frame, RigidTransform], scanner: Scanner, margin: int,
-           ) -> Window | None:
-    """The pixels that convex hulls of points (k, 3) in their frames can shade, with a margin, cut `margin` outside the detector; None where there are none."""
+def shadow(
+    outlines: list[tuple[Frame, Array]],
+    view: View,
+    T_FW: dict[Frame, RigidTransform],
+    scanner: Scanner,
+    margin: int,
+) -> Window | None:
+    """The pixels that convex hulls of points (k, 3) in their frames can shade, with a margin, cut `margin` outside
+    the detector; None where there are none."""
     boxes = shadow_boxes(outlines, view, T_FW)
     lo, hi = np.floor(boxes[:, 0].min(axis=0)) - margin, np.ceil(boxes[:, 1].max(axis=0)) + margin
     u_0, v_0 = max(int(lo[0]), -margin), max(int(lo[1]), -margin)
@@ -326,8 +368,16 @@ def shadow_boxes(outlines: list[tuple[Frame, Array]], view: View, T_FW: dict[Fra
 
 
 def add_transmission(
-    out: Array, window: Window, compiled: Compiled, beam: Beam, view: View, T_FW: dict[Frame, RigidTransform], *, f: int,
-    weight: float = 1.0, threads: int = 1,
+    out: Any,
+    window: Window,
+    compiled: Compiled,
+    beam: Beam,
+    view: View,
+    T_FW: dict[Frame, RigidTransform],
+    *,
+    f: int,
+    weight: float = 1.0,
+    threads: int = 1,
 ) -> None:
     """Add weight x transmission to `out` (4, n_v f, n_u f), the cells of the window's pixels.
 
@@ -337,8 +387,24 @@ def add_transmission(
     """
     R, t, centre = compiled.in_world(T_FW)
     boxes = shadow_boxes(list(zip(compiled.frame, compiled.corners, strict=True)), view, T_FW)
-    c = (compiled.kind, compiled.p, R, t, compiled.ops, compiled.first, compiled.material, centre, compiled.radius,
-         beam.w, beam.mu, view.source, view.O, view.U, view.V, boxes)
+    c = (
+        compiled.kind,
+        compiled.p,
+        R,
+        t,
+        compiled.ops,
+        compiled.first,
+        compiled.material,
+        centre,
+        compiled.radius,
+        beam.w,
+        beam.mu,
+        view.source,
+        view.O,
+        view.U,
+        view.V,
+        boxes,
+    )
     I = np.empty((window.n_v + 1, window.n_u + 1))
     seen = np.empty(I.shape, dtype=np.int64)
     mask = np.zeros(I.shape, dtype=np.bool_)

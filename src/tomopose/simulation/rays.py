@@ -1,8 +1,9 @@
 """Exact path lengths of rays through solids made of primitives: interval lists along the ray, in float64.
 
-A ray is s + t d with |d| = 1.  Every primitive gives the sorted list of distances t at which its surface is crossed, with
-the number of the surface crossed; Boolean operations merge two such lists by sweeping along the ray.  Before any quadratic
-is solved, the ray's origin is moved to the point nearest to the primitive, so that no small number is the difference of two
+A ray is s + t d with |d| = 1.  Every primitive gives the sorted list of distances t at which its surface is
+crossed, with the number of the surface crossed; Boolean operations merge two such lists by sweeping along the ray.
+Before any quadratic is solved, the ray's origin is moved to the point nearest to the primitive, so that no small
+number is the difference of two
 large ones: the error of a path stays below 1 nm even at grazing incidence.
 """
 
@@ -31,8 +32,8 @@ class Compiled:
 
     kind (n,), p (n, 3), R (n, 3, 3), t (n, 3): primitives, x_local = R' (x - t).  ops: postfix programs, first[k] to
     first[k + 1] for solid k: a primitive's number, or -1 union, -2 intersection, -3 difference.  material (m,): index
-    into `materials`.  centre (m, 3), radius (m,): bounding spheres.  frame (m,), solid (n,): whose frame, whose primitive.  corners: m arrays (k, 3) of points whose convex hull
-    holds the solid.
+    into `materials`.  centre (m, 3), radius (m,): bounding spheres.  frame (m,), solid (n,): whose frame, whose
+    primitive.  corners: m arrays (k, 3) of points whose convex hull holds the solid.
     """
 
     kind: Any
@@ -160,8 +161,9 @@ def _root(c: Any, n: int, lo: float, hi: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _torus(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, ring: float, tube: float, T: Any, S: Any,
-           row: int) -> int:
+def _torus(
+    ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, ring: float, tube: float, T: Any, S: Any, row: int
+) -> int:
     """Crossings of a torus, from an origin near it: the quartic's roots between its derivatives' roots."""
     b = ox * dx + oy * dy + oz * dz
     c = ox * ox + oy * oy + oz * oz - ring * ring - tube * tube
@@ -203,8 +205,22 @@ def _torus(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, rin
 
 
 @njit(cache=True, nogil=True)
-def _crossings(kind: Any, p: Any, R: Any, c: Any, q: int, ox: float, oy: float, oz: float, dx: float, dy: float,
-               dz: float, T: Any, S: Any, row: int) -> int:
+def _crossings(
+    kind: Any,
+    p: Any,
+    R: Any,
+    c: Any,
+    q: int,
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    T: Any,
+    S: Any,
+    row: int,
+) -> int:
     """Crossings of primitive q with the ray o + t d: into row `row` of T (distances) and S (faces); how many (even)."""
     # The ray's origin moves to the point nearest to the primitive's own origin; `shift` brings distances back.
     ex, ey, ez = ox - c[q, 0], oy - c[q, 1], oz - c[q, 2]
@@ -249,8 +265,9 @@ def _crossings(kind: Any, p: Any, R: Any, c: Any, q: int, ox: float, oy: float, 
 
 
 @njit(cache=True, nogil=True)
-def _cylinder(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, r: float, h: float, T: Any, S: Any,
-              row: int) -> int:
+def _cylinder(
+    ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, r: float, h: float, T: Any, S: Any, row: int
+) -> int:
     a = dx * dx + dy * dy
     lo, hi = -FAR, FAR
     if a < 1e-28:
@@ -270,8 +287,20 @@ def _cylinder(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, 
 
 
 @njit(cache=True, nogil=True)
-def _cone(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, r: float, h: float, slope: float, T: Any,
-          S: Any, row: int) -> int:
+def _cone(
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    r: float,
+    h: float,
+    slope: float,
+    T: Any,
+    S: Any,
+    row: int,
+) -> int:
     """Truncated cone, radius r + slope z for |z| <= h: convex, so one interval at most."""
     lo, hi, s_lo, s_hi = _slab(oz, dz, h, 1, -FAR, FAR, 0, 0)
     if not hi > lo:
@@ -314,7 +343,8 @@ def _cone(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, r: f
 
 @njit(cache=True, nogil=True)
 def _combine(T: Any, S: Any, a: int, na: int, b: int, nb: int, op: int, out: int) -> int:
-    """Merge rows a and b of crossings into row `out`: union (-1), intersection (-2) or difference (-3); -1 if too long."""
+    """Merge rows a and b of crossings into row `out`: union (-1), intersection (-2) or difference (-3); -1 if too
+    long."""
     i = j = n = 0
     in_a = in_b = inside = False
     while i < na or j < nb:
@@ -340,11 +370,31 @@ def _combine(T: Any, S: Any, a: int, na: int, b: int, nb: int, op: int, out: int
 
 
 @njit(cache=True, nogil=True)
-def trace(kind: Any, p: Any, R: Any, c: Any, ops: Any, first: Any, material: Any, centre: Any, radius: Any, active: Any,
-          ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, T: Any, S: Any, L: Any) -> Any:
+def trace(
+    kind: Any,
+    p: Any,
+    R: Any,
+    c: Any,
+    ops: Any,
+    first: Any,
+    material: Any,
+    centre: Any,
+    radius: Any,
+    active: Any,
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    T: Any,
+    S: Any,
+    L: Any,
+) -> Any:
     """Path lengths of one ray, per material, into L (mm); returns the ray's signature, or -1 where a list overflowed.
 
-    active (m,): which solids can be met at all.  o, d: origin and unit direction.  T (depth + 3, LARGEST), S (the same, one column more) int64: work space.  The
+    active (m,): which solids can be met at all.  o, d: origin and unit direction.  T (depth + 3, LARGEST), S (the
+        same, one column more) int64: work space.  The
     signature numbers the surfaces crossed in their order: rays that share it are joined by a smooth change of path.
     """
     for m in range(len(L)):
@@ -408,22 +458,59 @@ def trace(kind: Any, p: Any, R: Any, c: Any, ops: Any, first: Any, material: Any
 
 
 @njit(cache=True, nogil=True)
-def _trace_all(kind: Any, p: Any, R: Any, c: Any, ops: Any, first: Any, material: Any, centre: Any, radius: Any, o: Any,
-               d: Any, depth: int, L: Any) -> int:
+def _trace_all(
+    kind: Any,
+    p: Any,
+    R: Any,
+    c: Any,
+    ops: Any,
+    first: Any,
+    material: Any,
+    centre: Any,
+    radius: Any,
+    o: Any,
+    d: Any,
+    depth: int,
+    L: Any,
+) -> int:
     T, S = np.empty((depth + 3, LARGEST)), np.empty((depth + 3, LARGEST + 1), dtype=np.int64)
     active = np.ones(len(material), dtype=np.bool_)
     for i in range(len(d)):
-        if trace(kind, p, R, c, ops, first, material, centre, radius, active, o[i, 0], o[i, 1], o[i, 2], d[i, 0], d[i, 1],
-                 d[i, 2], T, S, L[i]) < 0:
+        if (
+            trace(
+                kind,
+                p,
+                R,
+                c,
+                ops,
+                first,
+                material,
+                centre,
+                radius,
+                active,
+                o[i, 0],
+                o[i, 1],
+                o[i, 2],
+                d[i, 0],
+                d[i, 1],
+                d[i, 2],
+                T,
+                S,
+                L[i],
+            )
+            < 0
+        ):
             return i
     return -1
 
 
-def path_lengths(solids: Compiled | list[Solid], o: Any, d: Any, T_FW: dict[Frame, RigidTransform] | None = None) -> Array:
+def path_lengths(
+    solids: Compiled | list[Solid], o: Any, d: Any, T_FW: dict[Frame, RigidTransform] | None = None
+) -> Array:
     """Path lengths (n, m), mm, of rays in each of the m materials.
 
-    o: origins (n, 3) or (3,), mm; d: directions (n, 3), any length; both in W, or, where T_FW is None, in the frame that
-    all solids share.  Only the ray's part in front of its origin counts.
+    o: origins (n, 3) or (3,), mm; d: directions (n, 3), any length; both in W, or, where T_FW is None, in the frame
+    that all solids share.  Only the ray's part in front of its origin counts.
     """
     compiled = solids if isinstance(solids, Compiled) else compile_solids(solids)
     R, t, centre = (compiled.R, compiled.t, compiled.centre) if T_FW is None else compiled.in_world(T_FW)
@@ -431,8 +518,21 @@ def path_lengths(solids: Compiled | list[Solid], o: Any, d: Any, T_FW: dict[Fram
     d = d / np.linalg.norm(d, axis=1, keepdims=True)
     o = np.ascontiguousarray(np.broadcast_to(np.asarray(o, dtype=np.float64), d.shape))
     L = np.zeros((len(d), len(compiled.materials)))
-    bad = _trace_all(compiled.kind, compiled.p, R, t, compiled.ops, compiled.first, compiled.material, centre,
-                     compiled.radius, o, d, compiled.depth, L)
+    bad = _trace_all(
+        compiled.kind,
+        compiled.p,
+        R,
+        t,
+        compiled.ops,
+        compiled.first,
+        compiled.material,
+        centre,
+        compiled.radius,
+        o,
+        d,
+        compiled.depth,
+        L,
+    )
     if bad >= 0:
         raise InputError(f"ray {bad} crosses more than {LARGEST} surfaces of one solid; split the solid in several")
     return L

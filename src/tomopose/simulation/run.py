@@ -55,8 +55,8 @@ class SimulatedRun:
     spectrum: Spectrum
     detector: Detector
     seed: int
-    spot: FocalSpot = FocalSpot()
-    motion: Motion = Motion()
+    spot: FocalSpot = field(default_factory=FocalSpot)
+    motion: Motion = field(default_factory=Motion)
     meshes: tuple[MeshSolid, ...] = ()
     materials: Mapping[str, Material] = field(default_factory=lambda: MATERIALS)
     engine: Literal["own", "gvxr"] = "own"
@@ -87,7 +87,7 @@ class SimulatedRun:
     @functools.cached_property
     def beam_materials(self) -> tuple[str, ...]:
         """The beam's columns: materials of the solids, then of the meshes."""
-        return tuple(dict.fromkeys(s.material for s in (*self.solids, *self.meshes)))
+        return tuple(dict.fromkeys([s.material for s in self.solids] + [m.material for m in self.meshes]))
 
     @functools.cached_property
     def beam(self) -> Beam:
@@ -106,12 +106,16 @@ class SimulatedRun:
         return [*tessellate(self.solids), *((m.mesh, m.material, m.frame) for m in self.meshes)]
 
     def frames(self, i: int, moment: float = 0.0) -> dict[Frame, RigidTransform]:
-        """Each frame's transform to W at pose i, by the true poses, at a moment between -1/2 and 1/2 of the exposure."""
+        """Each frame's transform to W at pose i, by the true poses, at a moment between -1/2 and 1/2 of the
+        exposure."""
         moved = RigidTransform(R=np.eye(3), t=moment * np.array(self.motion.shift), source=Frame.W, target=Frame.W)
-        T_TW = moved @ self.scanner.T_TW(self.poses.alpha[i] + moment * self.motion.alpha)
+        T_TW = moved @ self.scanner.T_TW(float(np.asarray(self.poses.alpha)[i]) + moment * self.motion.alpha)
         T_HW = T_TW @ self.T_HT
         return {
-            Frame.W: RigidTransform.identity(Frame.W), Frame.T: T_TW, Frame.H: T_HW, Frame.M: T_HW @ self.T_MH[i],
+            Frame.W: RigidTransform.identity(Frame.W),
+            Frame.T: T_TW,
+            Frame.H: T_HW,
+            Frame.M: T_HW @ self.T_MH[i],
         }
 
     def image(self, i: int, *, threads: int = 1) -> Any:
@@ -128,9 +132,9 @@ class SimulatedRun:
             "seed": self.seed,
         }
         if self.t is not None and self.ball_diameter is not None:
-            chain = {"T_HT": self.T_HT, "T_MH": self.T_MH, "t": self.t, "alpha": self.poses.alpha}
-            x_D = project_ball(self.scanner, **chain)
-            ellipse = silhouette_centre(self.scanner, ball_positions(self.scanner, **chain), self.ball_diameter / 2)
+            true: dict[str, Any] = {"T_HT": self.T_HT, "T_MH": self.T_MH, "t": self.t, "alpha": self.poses.alpha}
+            x_D = project_ball(self.scanner, **true)
+            ellipse = silhouette_centre(self.scanner, ball_positions(self.scanner, **true), self.ball_diameter / 2)
             document |= {
                 "t_mm": self.t,
                 "ball_diameter_mm": self.ball_diameter,
@@ -164,11 +168,13 @@ def transmission(run: SimulatedRun, i: int, *, threads: int = 1) -> Array:
     f = detector.cells
     cells = np.zeros((4, window.n_v * f, window.n_u * f), dtype=np.float32)
     for view, T_FW in views:
-        share = {"f": f, "weight": 1 / len(views), "threads": threads}
+        share: dict[str, Any] = {"f": f, "weight": 1 / len(views), "threads": threads}
         if run.engine == "gvxr":
             add_gvxr_transmission(cells, window, run, view, T_FW, f=f, weight=1 / len(views))
         elif run.meshes:
-            add_mesh_transmission(cells, window, run.compiled, run.meshes, run.beam_materials, run.beam, view, T_FW, **share)
+            add_mesh_transmission(
+                cells, window, run.compiled, run.meshes, run.beam_materials, run.beam, view, T_FW, **share
+            )
         else:
             assert run.compiled is not None
             add_transmission(cells, window, run.compiled, run.beam, view, T_FW, **share)
@@ -205,9 +211,20 @@ def render(run: SimulatedRun, i: int, *, threads: int = 1) -> Any:
 
 
 def simulate_ball_run(
-    scanner: Scanner, *, T_HT: RigidTransform, t: Any, poses: PoseSequence, ball_diameter: float = 8.0,
-    snr: float = 200.0, blur_sigma: float = 0.7, seed: int = 0, T_MH: RigidTransform | None = None,
-    voltage: float = 120.0, copper: float = 0.5, white: float = 45000.0, solids: tuple[Solid, ...] | None = None,
+    scanner: Scanner,
+    *,
+    T_HT: RigidTransform,
+    t: Any,
+    poses: PoseSequence,
+    ball_diameter: float = 8.0,
+    snr: float = 200.0,
+    blur_sigma: float = 0.7,
+    seed: int = 0,
+    T_MH: RigidTransform | None = None,
+    voltage: float = 120.0,
+    copper: float = 0.5,
+    white: float = 45000.0,
+    solids: tuple[Solid, ...] | None = None,
 ) -> SimulatedRun:
     """A calibration run: one ball in its holder, flat-corrected 16-bit images with photon noise.
 
@@ -222,13 +239,22 @@ def simulate_ball_run(
     """
     spectrum = tube_spectrum(voltage).filtered("Cu", copper).absorbed_energy("CsI", 0.6)
     return SimulatedRun(
-        scanner=scanner, poses=poses, T_HT=T_HT, T_MH=poses.T_MH if T_MH is None else T_MH, t=t,
-        ball_diameter=ball_diameter, solids=ball_in_holder(t=t, ball_diameter=ball_diameter) if solids is None else solids,
-        spectrum=spectrum, detector=Detector(snr=snr, blur_sigma=blur_sigma, white=white), seed=seed,
+        scanner=scanner,
+        poses=poses,
+        T_HT=T_HT,
+        T_MH=poses.T_MH if T_MH is None else T_MH,
+        t=t,
+        ball_diameter=ball_diameter,
+        solids=ball_in_holder(t=t, ball_diameter=ball_diameter) if solids is None else solids,
+        spectrum=spectrum,
+        detector=Detector(snr=snr, blur_sigma=blur_sigma, white=white),
+        seed=seed,
     )
 
 
-def render_all(run: SimulatedRun, *, threads: int = 1, progress: Callable[[int, int], None] | None = None) -> Iterator[Any]:
+def render_all(
+    run: SimulatedRun, *, threads: int = 1, progress: Callable[[int, int], None] | None = None
+) -> Iterator[Any]:
     """All radiographs in order, one at a time."""
     for i in range(len(run)):
         yield render(run, i, threads=threads)

@@ -83,7 +83,9 @@ class MTFPart(Part):
 class DetectorPart(Part):
     scintillator: str = "CsI"
     thickness_mm: float = 0.6
-    response: str | None = Field(None, description="CSV with columns energy_keV, response, in place of the scintillator")
+    response: str | None = Field(
+        None, description="CSV with columns energy_keV, response, in place of the scintillator"
+    )
     snr: float | None = None
     photons: float | None = None
     averages: int = 1
@@ -185,9 +187,7 @@ class SolidPart(Placed):
     shapes: tuple[ShapePart, ...] = Field(min_length=1)
 
 
-ObjectPart = Annotated[
-    BallPart | StandardPart | SpecimenPart | MeshPart | SolidPart, Field(discriminator="kind")
-]
+ObjectPart = Annotated[BallPart | StandardPart | SpecimenPart | MeshPart | SolidPart, Field(discriminator="kind")]
 
 
 class MountPart(Part):
@@ -257,7 +257,7 @@ class Scene(Part):
     @model_validator(mode="after")
     def _one_ball(self) -> Scene:
         if sum(isinstance(x, BallPart) for x in self.objects) > 1:
-            raise ValueError("a scene holds at most one ball (kind = \"ball\"); write further ones as solids")
+            raise ValueError('a scene holds at most one ball (kind = "ball"); write further ones as solids')
         return self
 
 

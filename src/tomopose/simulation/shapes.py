@@ -1,8 +1,8 @@
 """Solids: six primitives, joined by constructive solid geometry, filled with a material, fixed to a frame.
 
 A shape is written once, in its own coordinates, and moved by `placed`.  Shapes combine with `|` (union), `&`
-(intersection) and `-` (difference).  Later solids of a list displace earlier ones where they overlap, as a ball does that
-is pressed into a tube.
+(intersection) and `-` (difference).  Later solids of a list displace earlier ones where they overlap, as a ball
+does that is pressed into a tube.
 """
 
 from __future__ import annotations
@@ -92,8 +92,7 @@ class Primitive(Shape):
     t: Array = field(default_factory=lambda: np.zeros(3))
 
     def _placed(self, R: Array, t: Array) -> Primitive:
-        return Primitive(kind=self.kind, p=self.p, radius=self.radius, half=self.half, R=R @ self.R,
-                         t=R @ self.t + t)
+        return Primitive(kind=self.kind, p=self.p, radius=self.radius, half=self.half, R=R @ self.R, t=R @ self.t + t)
 
     def primitives(self) -> list[Primitive]:
         return [self]
@@ -158,8 +157,13 @@ def cylinder(radius: float, z_0: float, z_1: float) -> Shape:
     """A cylinder about z from z_0 to z_1, mm."""
     _positive("cylinder", radius=radius, length=z_1 - z_0)
     h = (z_1 - z_0) / 2
-    return Primitive(kind=CYLINDER, p=(radius, h), radius=math.hypot(radius, h), half=(radius, radius, h),
-                     t=np.array([0.0, 0.0, (z_0 + z_1) / 2]))
+    return Primitive(
+        kind=CYLINDER,
+        p=(radius, h),
+        radius=math.hypot(radius, h),
+        half=(radius, radius, h),
+        t=np.array([0.0, 0.0, (z_0 + z_1) / 2]),
+    )
 
 
 def cone(radius_0: float, radius_1: float, z_0: float, z_1: float) -> Shape:
@@ -172,8 +176,9 @@ def cone(radius_0: float, radius_1: float, z_0: float, z_1: float) -> Shape:
     h = (z_1 - z_0) / 2
     p = ((radius_0 + radius_1) / 2, h, (radius_1 - radius_0) / (2 * h))
     widest = max(radius_0, radius_1)
-    return Primitive(kind=CONE, p=p, radius=math.hypot(widest, h), half=(widest, widest, h),
-                     t=np.array([0.0, 0.0, (z_0 + z_1) / 2]))
+    return Primitive(
+        kind=CONE, p=p, radius=math.hypot(widest, h), half=(widest, widest, h), t=np.array([0.0, 0.0, (z_0 + z_1) / 2])
+    )
 
 
 def box(size_x: float, size_y: float, size_z: float) -> Shape:
@@ -187,7 +192,9 @@ def torus(ring_radius: float, tube_radius: float) -> Shape:
     """A ring about z: a circle of tube_radius whose centre runs around a circle of ring_radius, mm."""
     _positive("torus", ring_radius=ring_radius, tube_radius=tube_radius)
     if tube_radius >= ring_radius:
-        raise InputError(f"torus: tube radius {tube_radius:g} mm is not smaller than the ring radius {ring_radius:g} mm")
+        raise InputError(
+            f"torus: tube radius {tube_radius:g} mm is not smaller than the ring radius {ring_radius:g} mm"
+        )
     reach = ring_radius + tube_radius
     return Primitive(kind=TORUS, p=(ring_radius, tube_radius), radius=reach, half=(reach, reach, tube_radius))
 

@@ -1,9 +1,9 @@
 """The multi-feature specimen (paper sec. 6.1, figs. 9 to 13): aluminium, 60 mm long, as a closed mesh.
 
-Named in the paper are its length, cylindrical faces at both ends, six cuboids, calottes, a threaded hole, and measurands
-(L1 to L6 between planes, L7 between calottes) of 4 to 12 mm.  All else is this project's own.  The thread is a row of
-circular grooves.  "As made" moves each vertex along its normal by a smooth deviation of its feature and leaves vertices on
-edges where they are, as the paper's reference mesh does.
+Named in the paper are its length, cylindrical faces at both ends, six cuboids, calottes, a threaded hole, and
+measurands (L1 to L6 between planes, L7 between calottes) of 4 to 12 mm.  All else is this project's own.  The
+thread is a row of circular grooves.  "As made" moves each vertex along its normal by a smooth deviation of its
+feature and leaves vertices on edges where they are, as the paper's reference mesh does.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ CALOTTE_RADIUS, CALOTTE_DISTANCE = 3.0, 10.0
 """Radius of the calottes, and the distance L7 between the two of them, mm."""
 BORES = ((10.0, 45.0, 2.0), (10.0, 135.0, 2.5), (10.0, 225.0, 1.5), (10.0, 315.0, 3.0), (5.5, 0.0, 1.0))
 """Bores of the upper flange: distance from the axis (mm), angle (deg), radius (mm)."""
-THREAD_RADIUS, THREAD_PITCH, THREAD_DEPTH = 2.5, 0.8, 14.0
+THREAD_RADIUS, THREAD_PITCH, THREAD_DEPTH = 2.5, 0.8, 10.4
 FLAT = 6.5
 """Distance of the core's six flats from the axis, mm."""
 DEVIATION = 0.008
@@ -84,7 +84,9 @@ def _nominal(edge: float, segments: int) -> Mesh:
         body += cuboid.translate(place).rotate([0.0, 0.0, 60.0 * k])
     for distance, angle, radius in BORES:
         c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
-        body -= rod(radius, z - FLANGE_LENGTH - 1.0, z + 1.0, segments // 2).translate([distance * c, distance * s, 0.0])
+        body -= rod(radius, z - FLANGE_LENGTH - 1.0, z + 1.0, segments // 2).translate(
+            [distance * c, distance * s, 0.0]
+        )
     for x in (-CALOTTE_DISTANCE / 2, CALOTTE_DISTANCE / 2):
         body -= M.sphere(CALOTTE_RADIUS, segments).translate([x, 0.0, -z])
     thread = rod(THREAD_RADIUS, -z - 1.0, -z + THREAD_DEPTH, segments // 2)
@@ -102,7 +104,8 @@ def _nominal(edge: float, segments: int) -> Mesh:
 def specimen_mesh(*, deviations: bool = False, edge: float = 0.5, segments: int = 180, seed: int = 0) -> Mesh:
     """The specimen, axis along z, origin at its middle.
 
-    deviations: as made instead of nominal, drawn by `seed`.  edge: largest side of a triangle, mm.  segments: of a circle.
+    deviations: as made instead of nominal, drawn by `seed`.  edge: largest side of a triangle, mm.  segments: of a
+        circle.
     """
     nominal = _nominal(edge, segments)
     return as_made(nominal, seed=seed) if deviations else nominal
@@ -130,6 +133,8 @@ def as_made(nominal: Mesh, *, seed: int = 0, sigma: float = DEVIATION) -> Mesh:
     direction = rng.standard_normal((n, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     wave = 2 * np.pi / rng.uniform(8.0, 40.0, n)
-    form = np.sin(v @ (direction * wave[:, None]).T + rng.uniform(0, 2 * np.pi, n)).sum(axis=1) * sigma * math.sqrt(2 / n)
+    form = (
+        np.sin(v @ (direction * wave[:, None]).T + rng.uniform(0, 2 * np.pi, n)).sum(axis=1) * sigma * math.sqrt(2 / n)
+    )
     form[agree < math.cos(math.radians(SHARP_DEG))] = 0.0
     return Mesh(vertices=v + form[:, None] * vertex_normal, faces=f)

@@ -1,8 +1,8 @@
 """The spectrum that the detector feels, and polychromatic Beer-Lambert with as few energies as accuracy allows.
 
 T = sum_E w(E) exp(-sum_m mu_m(E) L_m), where w(E) = photons x filters x response, normalised to 1.  `condense` replaces
-the hundred or so energies by a dozen of them with new weights (non-negative least squares), which makes the sum ten times
-cheaper per ray and wrong by less than `CONDENSED_ERROR`.
+the hundred or so energies by a dozen of them with new weights (non-negative least squares), which makes the sum ten
+times cheaper per ray and wrong by less than `CONDENSED_ERROR`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ class Spectrum:
         """keV."""
         return float(self.energy @ self.weight / self.weight.sum())
 
-    def filtered(self, material: Material | str, thickness: float, materials: Mapping[str, Material] = MATERIALS) -> Spectrum:
+    def filtered(
+        self, material: Material | str, thickness: float, materials: Mapping[str, Material] = MATERIALS
+    ) -> Spectrum:
         """Behind a plate of that material and thickness (mm)."""
         if not thickness >= 0:
             raise InputError(f"filter {material}: thickness is {thickness} mm; it may not be negative")
@@ -53,8 +55,9 @@ class Spectrum:
             weight=self.weight * np.exp(-attenuation(material, self.energy, materials=materials) * thickness),
         )
 
-    def absorbed_energy(self, material: Material | str, thickness: float, materials: Mapping[str, Material] = MATERIALS
-                        ) -> Spectrum:
+    def absorbed_energy(
+        self, material: Material | str, thickness: float, materials: Mapping[str, Material] = MATERIALS
+    ) -> Spectrum:
         """As an energy-integrating scintillator of that material and thickness (mm) weighs it."""
         if not thickness > 0:
             raise InputError(f"scintillator: thickness is {thickness} mm; a positive number is needed")
@@ -106,8 +109,9 @@ class Beam:
         return np.exp(-np.asarray(L) @ self.mu.T) @ self.w
 
 
-def condense(spectrum: Spectrum, materials: tuple[str, ...], longest: Any, materials_table: Mapping[str, Material] = MATERIALS
-             ) -> Beam:
+def condense(
+    spectrum: Spectrum, materials: tuple[str, ...], longest: Any, materials_table: Mapping[str, Material] = MATERIALS
+) -> Beam:
     """A dozen energies that stand for the whole spectrum.
 
     materials: the m names of path columns; longest: (m,) longest path in each, mm.  The weights are the non-negative

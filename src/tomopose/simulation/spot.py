@@ -17,11 +17,11 @@ GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 @dataclass(frozen=True, kw_only=True)
 class FocalSpot:
-    """size_u, size_v (mm, in the plane of S): full width at half maximum of a "gaussian", diameters of a "disc", sides of
-    a "rectangle".
+    """size_u, size_v (mm, in the plane of S): full width at half maximum of a "gaussian", diameters of a "disc",
+    sides of a "rectangle".
 
-    method "convolved" (gaussian only): the spot's shadow on the panel, (M - 1) times its size with M at the origin of M,
-    joins the detector's blur.  "sampled": the frame is the mean over `points` point sources, exact in depth.
+    method "convolved" (gaussian only): the spot's shadow on the panel, (M - 1) times its size with M at the origin
+    of M, joins the detector's blur.  "sampled": the frame is the mean over `points` point sources, exact in depth.
     """
 
     shape: Literal["point", "gaussian", "disc", "rectangle"] = "point"
@@ -80,7 +80,9 @@ class Motion:
 
     def __post_init__(self) -> None:
         if not np.isfinite([self.alpha, *self.shift]).all() or self.points < 1:
-            raise InputError(f"motion: alpha {self.alpha} rad, shift {self.shift} mm, {self.points} points cannot be used")
+            raise InputError(
+                f"motion: alpha {self.alpha} rad, shift {self.shift} mm, {self.points} points cannot be used"
+            )
 
     def moments(self) -> Array:
         """Times from -1/2 to 1/2, midpoints of equal parts; a single 0 where nothing moves."""

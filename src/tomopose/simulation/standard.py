@@ -1,8 +1,8 @@
 """The multi-sphere standard (paper sec. 6.1): 27 ruby spheres of 5 mm on ceramic shafts over an Invar base.
 
-The paper names the parts but not where they stand, so the layout is this project's own: nine shafts on three circles, each
-with a height of its own, and spheres at three heights above one another reached by shafts of three lengths; all distances
-between spheres differ.  data/standard.csv holds the coordinates, as a calibration certificate would.
+The paper names the parts but not where they stand, so the layout is this project's own: a sunflower spiral seen from
+above, heights that jump from neighbour to neighbour, all 351 distances different.  data/standard.csv holds the
+coordinates, as a calibration certificate would.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ def multi_sphere_standard(*, shafts: bool = True, base: bool = True) -> tuple[So
     """The standard as solids in its own frame; each sphere is displaced by no shaft, each shaft ends at its sphere."""
     solids: list[Solid] = []
     if base:
-        solids.append(Solid(shape=cylinder(BASE_RADIUS, BASE_TOP - BASE_HEIGHT, BASE_TOP), material="Invar", name="base"))
+        solids.append(
+            Solid(shape=cylinder(BASE_RADIUS, BASE_TOP - BASE_HEIGHT, BASE_TOP), material="Invar", name="base")
+        )
     for k, (c, d) in enumerate(zip(sphere_centres(), sphere_diameters(), strict=True)):
         at: dict[str, Any] = {"t": c}
         if shafts:

@@ -79,6 +79,11 @@ def tessellate(solids: tuple[Solid, ...], *, segments: int = 256) -> list[tuple[
                 body = body - later
         mesh = body.to_mesh64()
         if len(mesh.tri_verts):
-            out.append((Mesh(vertices=np.asarray(mesh.vert_properties)[:, :3], faces=np.asarray(mesh.tri_verts)),
-                        solid.material, solid.frame))
+            out.append(
+                (
+                    Mesh(vertices=np.asarray(mesh.vert_properties)[:, :3], faces=np.asarray(mesh.tri_verts)),
+                    solid.material,
+                    solid.frame,
+                )
+            )
     return out
