@@ -7,6 +7,8 @@ With a correlation rho(h) of the residuals at distance h, the mean of n points h
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from tomopose.errors import InputError
@@ -31,7 +33,7 @@ def effective_number(points: Array, residuals: Array, correlation_range: float) 
         return float(n)
     chosen = np.arange(0, n, max(n // SAMPLES, 1))
     tree = cKDTree(points)
-    pairs: list[list[int]] = list(tree.query_ball_point(points[chosen], correlation_range))
+    pairs: Any = tree.query_ball_point(points[chosen], correlation_range)
     first = np.repeat(chosen, [len(p) for p in pairs])
     second = np.concatenate([np.asarray(p, dtype=np.intp) for p in pairs])
     first, second = first[first != second], second[first != second]

@@ -167,8 +167,8 @@ def _fit(
     n_effective = effective_number(x[used], (d / s)[used], correlation_range)
     share = n_effective / int(used.sum())
     return Feature(
-        kind=kind, vector=vector, covariance=sum((_covariance(b, share) for b in blocks), np.zeros((8, 8))), points=x, used=used,
-        residuals=d, n_effective=n_effective,
+        kind=kind, vector=vector, covariance=sum((_covariance(b, share) for b in blocks), np.zeros((8, 8))),
+        points=x, used=used, residuals=d, n_effective=n_effective,
         outlier_rule="none" if outliers is None else f"{outliers:g} rms, repeated until none is left",
     )
 

@@ -1,0 +1,206 @@
+"""The surface of blurred balls in closed form, lengths in voxels unless said otherwise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from blurred_shapes import as_volume, balls_on_a_lattice, balls_volume, blurred_ball, grid_of
+from scipy.spatial import cKDTree
+
+from tomopose.errors import InputError, ShapeError
+from tomopose.measurement.edge_search import EdgeFlag, EdgeSettings
+from tomopose.measurement.fits import fit_sphere
+from tomopose.measurement.histogram import given_levels, grey_levels
+from tomopose.measurement.probing import probe, sphere_pattern
+from tomopose.measurement.surface import surface, surfaces
+from tomopose.volume import Volume, VoxelGrid
+
+V = 0.1482
+R, SIGMA = 12.3, 1.0
+
+
+@pytest.fixture(scope="module")
+def balls():
+    rng = np.random.default_rng(11)
+    grid = VoxelGrid(shape=(78, 74, 75), spacing=np.full(3, V), centre=np.array([3.0, -2.0, 5.0]))
+    return grid, balls_on_a_lattice(rng, grid, 2, R)
+
+
+def errors(found, grid, centres, radius=R):
+    """Errors of centres (n, 3) and radii (n,), voxels."""
+    near = np.argmin(np.linalg.norm(found.points[:, None] - centres, axis=2), axis=1)
+    fits = [fit_sphere(found.points[(near == k) & found.good]) for k in range(len(centres))]
+    v = grid.spacing[0]
+    return (np.array([f.point for f in fits]) - centres) / v, np.array([f.radius for f in fits]) / v - radius
+
+
+@pytest.fixture(scope="module")
+def clean(balls):
+    grid, centres = balls
+    return as_volume(balls_volume(grid, centres, np.full(8, R * V), SIGMA * V), grid)
+
+
+@pytest.fixture(scope="module")
+def drifting(balls):
+    grid, centres = balls
+    rng = np.random.default_rng(5)
+    values = balls_volume(grid, centres, np.full(8, R * V), SIGMA * V, 1 + 0.13 * rng.uniform(-1, 1, 8))
+    values += np.linspace(-0.1, 0.1, grid.shape[2]) + 0.05 * rng.standard_normal(grid.shape)
+    return as_volume(values, grid)
+
+
+def test_the_blurred_ball_is_one_inside_and_zero_outside():
+    assert blurred_ball(0.0, 10.0, 1.0) == pytest.approx(1.0, abs=1e-9)
+    assert blurred_ball(20.0, 10.0, 1.0) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_clean_centres_and_the_known_curvature_bias(balls, clean):
+    grid, centres = balls
+    found = surface(clean)
+    centre, radius = errors(found, grid, centres)
+    assert np.sqrt(np.mean(centre**2)) < 1e-4
+    assert radius == pytest.approx(-(SIGMA**2) / R, abs=2e-3)
+    assert found.sigma / V == pytest.approx(SIGMA, abs=0.01)
+    assert not found.corrected
+
+
+def test_the_correction_removes_the_curvature_bias_and_says_so(balls, clean):
+    grid, centres = balls
+    found = surface(clean, curvature_correction=True)
+    assert np.abs(errors(found, grid, centres)[1]).max() < 2e-3
+    assert found.corrected
+    assert found.settings["curvature_correction"] is True
+
+
+def test_drift_spoils_the_fixed_level_but_not_the_local_edge(balls, drifting):
+    grid, centres = balls
+    fixed = errors(surface(drifting, method="iso-50"), grid, centres)[1]
+    local = errors(surface(drifting), grid, centres)[1]
+    assert np.std(fixed) > 0.05
+    assert np.std(local) < 0.006
+
+
+def test_the_local_half_agrees_with_the_fitted_step_on_clean_data(balls, clean):
+    grid, centres = balls
+    half, step = (errors(surface(clean, method=m), grid, centres) for m in ("local-50", "esf"))
+    assert half[1] == pytest.approx(step[1], abs=2e-3)
+
+
+def test_slabs_change_memory_not_result(clean):
+    whole, slabs = surface(clean, layers=500), surface(clean, layers=17)
+    assert len(whole) == len(slabs)
+    assert len(whole.faces) == len(slabs.faces)
+    apart = cKDTree(whole.points).query(slabs.points)[0]
+    assert apart.max() < 1e-5 * V
+
+
+def test_the_mesh_is_closed_and_its_triangles_look_outwards(clean, balls):
+    found = surface(clean)
+    a, b, c = (found.points[found.faces[:, k]] - balls[0].centre for k in range(3))
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
+    assert volume == pytest.approx(8 * 4 / 3 * np.pi * ((R - SIGMA**2 / R) * V) ** 3, rel=5e-3)
+    edges = np.sort(np.concatenate([found.faces[:, [0, 1]], found.faces[:, [1, 2]], found.faces[:, [2, 0]]]), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+
+
+def test_axes_are_not_mixed_up_with_voxels_of_three_sizes():
+    grid = VoxelGrid(shape=(61, 50, 43), spacing=np.array([0.13, 0.11, 0.09]), centre=np.array([1.0, 2.0, -3.0]))
+    centre = np.array([1.2, 1.7, -2.9])
+    volume = as_volume(balls_volume(grid, [centre], [1.6], 0.13), grid)
+    found = surface(volume)
+    fit = fit_sphere(found.points[found.good])
+    assert np.linalg.norm(fit.point - centre) < 2e-5
+    assert fit.radius == pytest.approx(1.6 - 0.13**2 / 1.6, abs=3e-4)
+
+
+def test_two_materials_give_two_surfaces():
+    grid = grid_of(60, 0.1, (0, 0, 0))
+    values = 0.5 * balls_volume(grid, [[0, 0, 0]], [2.2], 0.1) + 0.5 * balls_volume(grid, [[0, 0, 0]], [1.2], 0.1)
+    outer, inner = surfaces(as_volume(values, grid), materials=2)
+    assert fit_sphere(outer.points[outer.good]).radius == pytest.approx(2.2 - 0.01 / 2.2, abs=2e-3)
+    assert fit_sphere(inner.points[inner.good]).radius == pytest.approx(1.2 - 0.01 / 1.2, abs=2e-3)
+
+
+def wall(thickness):
+    grid = grid_of(48, 0.1, (0, 0, 0))
+    x = grid.origin[0] + 0.1 * np.arange(48)
+    from scipy.special import ndtr
+
+    row = ndtr((x + thickness / 2) / 0.1) - ndtr((x - thickness / 2) / 0.1)
+    return as_volume(np.broadcast_to(row, grid.shape).copy(), grid)
+
+
+def test_a_thin_wall_is_flagged():
+    with pytest.raises(InputError, match="THIN"):
+        surface(wall(0.35), levels=given_levels(0.0, 1.0))
+
+
+def test_a_thick_wall_is_measured_at_its_place():
+    found = surface(wall(2.0), levels=given_levels(0.0, 1.0))
+    assert np.abs(found.points[found.good, 0]) == pytest.approx(1.0, abs=1e-4)
+    inside = found.flags & EdgeFlag.BORDER > 0
+    near_the_border = np.abs(found.points[:, 1:]).max(axis=1) > 2.2
+    assert (near_the_border | ~inside).all()
+
+
+def test_probing_finds_the_ball_without_a_mesh(balls, clean):
+    centres = balls[1]
+    points, normals = sphere_pattern(centres[3] + 0.4 * V, (R + 0.5) * V, 400)
+    found = probe(clean, points, normals)
+    fit = fit_sphere(found.points[found.good])
+    assert found.good.mean() > 0.99
+    assert np.linalg.norm(fit.point - centres[3]) < 2e-4 * V
+    assert fit.radius / V == pytest.approx(R - SIGMA**2 / R, abs=2e-3)
+
+
+def test_probing_searches_far(balls, clean):
+    _, centres = balls
+    points, normals = sphere_pattern(centres[0], (R - 6.0) * V, 300)
+    found = probe(clean, points, normals, search_mm=8 * V)
+    assert fit_sphere(found.points[found.good]).radius / V == pytest.approx(R - SIGMA**2 / R, abs=3e-3)
+
+
+class TestBadInput:
+    def test_one_grey(self):
+        grid = grid_of(20)
+        with pytest.raises(InputError, match="one grey"):
+            surface(as_volume(np.full(grid.shape, 0.3), grid))
+
+    def test_not_finite(self, clean):
+        values = clean.values.copy()
+        values[::2] = np.nan
+        with pytest.raises(InputError, match="not finite"):
+            surface(Volume(values=values, grid=clean.grid))
+
+    def test_inverted_contrast(self, clean):
+        with pytest.raises(InputError, match="inverted"):
+            surface(Volume(values=1 - clean.values, grid=clean.grid))
+        with pytest.raises(InputError, match="inverted"):
+            given_levels(1.0, 0.2)
+
+    def test_no_voxel_on_one_side_of_the_level(self, clean):
+        with pytest.raises(InputError, match="no surface"):
+            surface(clean, levels=given_levels(5.0, 9.0))
+
+    def test_probing_into_nothing(self, clean, balls):
+        points, normals = sphere_pattern(balls[1][0], 4 * V, 50)
+        with pytest.raises(InputError, match="no edge"):
+            probe(clean, points, normals)
+
+    def test_probing_with_normals_turned_round(self, clean, balls):
+        points, normals = sphere_pattern(balls[1][0], R * V, 50)
+        with pytest.raises(InputError, match="no edge"):
+            probe(clean, points, -normals)
+
+    def test_shapes(self, clean):
+        with pytest.raises(ShapeError):
+            probe(clean, np.zeros((3, 2)), np.zeros((3, 2)))
+
+    def test_settings(self):
+        for bad in ({"search_distance": 0.0}, {"window": 0.5}, {"contrast_threshold": 1.0}, {"sigma": -1.0}):
+            with pytest.raises(InputError):
+                EdgeSettings(**bad)
+
+    def test_a_missing_mode(self, clean):
+        with pytest.raises(InputError, match="modes"):
+            grey_levels(clean, 5)
