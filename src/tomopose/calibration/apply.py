@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from tomopose.calibration.kinematic_trajectory import trajectory_sigma
 from tomopose.calibration.propagate import field_of_view_points, matrix_point_sigma
 from tomopose.calibration.result import Calibration
 from tomopose.errors import InputError
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
 from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 from tomopose.manipulator.poses import PIVOT_TOLERANCE_MM, PoseSequence
+from tomopose.units import Array
 
 SCANNER_TOLERANCE = 1e-9
 
@@ -43,6 +45,14 @@ def _require_same_scanner(calibration: Calibration, scanner: Scanner) -> None:
             )
 
 
+def _point_sigma(calibration: Calibration, commanded: PoseSequence, poses: PoseSequence, x_W: Array) -> Array:
+    """(n, m) px.  With identified errors of the manipulator, mount and errors share what no measurement depends on, a
+    rigid pose of the object; it is removed there."""
+    if "kind" not in calibration.manipulator:
+        return matrix_point_sigma(calibration, poses, x_W)
+    return np.asarray(np.sqrt(np.mean(trajectory_sigma(calibration, commanded, x_W) ** 2, axis=2)))
+
+
 def projection_matrices(
     calibration: Calibration,
     poses: PoseSequence,
@@ -69,6 +79,7 @@ def projection_matrices(
     _require_same_pivot(calibration, poses)
     if scanner is not None:
         _require_same_scanner(calibration, scanner)
+    commanded = poses
     scale = float(calibration.manipulator.get("translation_scale", 1.0))
     if calibration.model != "rigid":
         from tomopose.manipulator.error_models import corrected_poses
@@ -86,7 +97,7 @@ def projection_matrices(
         p_u=own.p_u,
         p_v=own.p_v,
         pose_id=poses.pose_id,
-        points_sigma=matrix_point_sigma(calibration, poses, x_W),
+        points_sigma=_point_sigma(calibration, commanded, poses, x_W),
         scanner=own,
     )
     return matrices if binning == 1 else matrices.binned(binning)

@@ -5,6 +5,7 @@ The measure is delta = (chi2_rival - chi2_declared) / max(1, min of both / dof),
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 
 from tomopose.calibration.estimate import best_fit
 from tomopose.calibration.fit import Fit, blocks, minimise
-from tomopose.calibration.initial import closed_form, ray_equations
+from tomopose.calibration.initial import closed_form, other_starts, ray_equations
 from tomopose.calibration.parameters import UNITS, FreeParameters, free_parameters
 from tomopose.calibration.problem import Problem, pair
 from tomopose.calibration.rivals import RIVALS, Rival
@@ -24,7 +25,11 @@ from tomopose.observations import BallObservations
 from tomopose.units import Array
 
 SAME, BETTER = 9.0, 25.0
-"""|delta| below SAME (3 sigma): cannot be told apart.  delta below -BETTER (5 sigma): the rival fits better."""
+"""delta below SAME (3 sigma): cannot be told apart.  delta below -BETTER (5 sigma): the rival fits better."""
+
+GOOD_CHI2, CLEARLY = 4.0, 1.5
+"""Where the rival, too, leaves chi2/dof above GOOD_CHI2, poses or sigmas are wrong in ways of their own, and delta has
+no such meaning: the rival must lower chi2 by the factor CLEARLY to count as better."""
 
 RIVAL_ITERATIONS = 20
 """A rival that is right needs fewer; one that is wrong is not worth more."""
@@ -106,13 +111,25 @@ def _rms(problem: Problem, fit: Fit, free: FreeParameters) -> float:
     return float(np.sqrt((r**2).sum(axis=1).mean()))
 
 
-def _fit_rival(problem: Problem, rays: tuple[Array, Array], free: FreeParameters, held: FreeParameters) -> Fit:
+def _fit_rival(problem: Problem, rays: tuple[Array, Array], free: FreeParameters, held: FreeParameters,
+               starts: int) -> Fit:
     fit = minimise(problem, held, closed_form(problem, *rays), iterations=RIVAL_ITERATIONS)
+    if not np.isfinite(fit.chi2):
+        # mirrored data have no closed form in front of the source; the residual they leave is still worth knowing
+        others = (minimise(problem, held, start, iterations=RIVAL_ITERATIONS)
+                  for start in itertools.islice(other_starts(problem, *rays), starts))
+        fit = minimise(problem, held, min((fit, *others), key=lambda one: one.chi2))
     return minimise(problem, free, fit, iterations=RIVAL_ITERATIONS) if len(free) else fit
 
 
-def ranked(problem: Problem, free: FreeParameters, fit: Fit, rivals: Iterable[Rival] = RIVALS) -> Diagnosis:
-    """The declared reading, fitted by `fit`, against rivals."""
+def ranked(
+    problem: Problem, free: FreeParameters, fit: Fit, rivals: Iterable[Rival] = RIVALS, *, starts: int = 24
+) -> Diagnosis:
+    """The declared reading, fitted by `fit`, against rivals.
+
+    starts: how many rotations are tried for a rival whose closed form leads nowhere.  Such a rival is not the truth (of
+    that the closed form finds the optimum); with 0 it is left out.
+    """
     held = free_parameters(problem.scanners, fix=tuple(UNITS))
     rays = ray_equations(problem)
     m = fit.N.shape[0]
@@ -132,7 +149,7 @@ def ranked(problem: Problem, free: FreeParameters, fit: Fit, rivals: Iterable[Ri
         if dof_r <= 0:
             continue
         same_rays = changed.x_D is problem.x_D and changed.alpha is problem.alpha
-        other = _fit_rival(changed, rays if same_rays else ray_equations(changed), free, held)
+        other = _fit_rival(changed, rays if same_rays else ray_equations(changed), free, held, starts)
         if not np.isfinite(other.chi2):
             continue
         found.append(_judged(rival, changed, other, free, fit.chi2, dof, dof_r))
@@ -149,7 +166,8 @@ def _judged(rival: Rival, changed: Problem, other: Fit, free: FreeParameters, ch
     chi2_r = other.chi2 * dof / dof_r
     delta = (chi2_r - chi2) / max(1.0, min(chi2, chi2_r) / dof)
     factor = max(chi2, dof) / max(chi2_r, dof)
-    outcome = "better" if delta < -BETTER else "same" if delta < SAME else "worse"
+    believable = chi2_r < GOOD_CHI2 * dof or factor > CLEARLY
+    outcome = "better" if delta < -BETTER and believable else "same" if delta < SAME else "worse"
     return Hypothesis(
         name=rival.name, words=rival.words, cure=rival.cure, d_rms=_rms(changed, other, free), chi2=other.chi2,
         dof=dof_r, delta=float(delta), factor=float(factor), outcome=outcome, symmetry=rival.symmetry,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -174,8 +174,8 @@ def calibrate(
     *,
     manipulator: Any = None,
     model: str = "auto",
-    free: Iterable[str] = (),
-    fix: Iterable[str] = (),
+    free: Sequence[str] = (),
+    fix: Sequence[str] = (),
     priors: Mapping[str, float] | None = None,
     robust: bool = True,
     hypotheses: bool = True,
@@ -219,7 +219,7 @@ def calibrate(
     if hypotheses:
         other = set_pose_rival(problem, poses)
         quick = [r for r in (*RIVALS, *([other] if other else [])) if r.quick]
-        diagnosis = ranked(stated.used, freed, stated.fit, quick)
+        diagnosis = ranked(stated.used, freed, stated.fit, quick, starts=0)
     arguments = {"model": model, "free": list(free), "fix": list(fix), "priors": dict(priors or {}), "robust": robust}
     rigid = _calibration(solution, stated, diagnosis, arguments)
     if not rigid.converged and raise_on_failure:
@@ -228,4 +228,6 @@ def calibrate(
         return rigid
     from tomopose.calibration.kinematic import calibrate_kinematic
 
-    return calibrate_kinematic(scanner, poses, observations, manipulator=manipulator, model=model, rigid=rigid)
+    return calibrate_kinematic(
+        scanner, poses, observations, manipulator=manipulator, model=model, rigid=rigid, robust=robust
+    )
