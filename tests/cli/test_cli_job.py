@@ -109,3 +109,35 @@ def test_doctor_lists_engines_and_install_lines(capsys):
     shown = json.loads(capsys.readouterr().out)
     assert {"cpu", "rtk", "astra"} <= set(shown["engines"])
     assert shown["extras"]["recon"]["install"].startswith("pip install")
+
+
+def test_compare_and_monitor(files, capsys):
+    f = files.folder
+    for out in ("a", "b", "c"):
+        assert run(files.calibrate(out)) == 0
+    a, b = str(f / "a" / "calibration.json"), str(f / "b" / "calibration.json")
+    assert run(["compare", a, b, "--json", "--out", str(f / "change.html")]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["mount_changed"] is False
+    assert_allclose(shown["difference"], 0, atol=MILLIMETRE)
+    for out in ("a", "b", "c"):
+        words = ["monitor", str(f / "history.jsonl"), "--add", str(f / out / "calibration.json"), "--label", out]
+        assert run([*words, "--quiet"]) == 0
+    assert run(["monitor", str(f / "history.jsonl"), "--out", str(f / "history.html"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["calibrations"] == 3
+    assert (f / "history.html").stat().st_size > 1000
+
+
+def test_a_rival_that_fits_better_is_exit_code_3(files, capsys):
+    """Rows exchanged among poses: the files are well formed, but the reading of them is wrong."""
+    wrong = files.folder / "signs.csv"
+    angles = np.degrees(files.poses.T_MH.angles) * [-1, -1, -1]
+    poses = tp.PoseSequence.from_table(
+        files.poses.T_MH.t, angles, pose_id=files.poses.pose_id, alpha=files.poses.alpha
+    )
+    tp.write_poses(wrong, poses)
+    words = ["diagnose", "--scanner", str(files.folder / "scanner.json"), "--poses", str(wrong)]
+    assert run([*words, "--observations", str(files.folder / "observations.csv"), "--json"]) == 3
+    assert json.loads(capsys.readouterr().out)["advice"]
+    assert run(files.calibrate(poses=wrong)) == 3
+    assert files.json("cal/calibration.json")["verdict"] != "trustworthy"

@@ -34,6 +34,7 @@ def demo(
     The folder is laid out as one would lay out one's own data, and the result is held against the simulation's truth.
     """
     import tomopose as tp
+    from tomopose.calibration.exact import d_rms_exact
     from tomopose.cli.job import calibration_summary, exit_code, observe, open_for, write_calibration_folder
     from tomopose.cli.simulated import RADIOGRAPHS, write_run
     from tomopose.files import require_absent
@@ -65,14 +66,16 @@ def demo(
     tp.export(matrices, out / "geometry", formats="all", force=force)
 
     off = (calibration.T_HT.t - setup.T_HT.t) * 1000.0
+    found = d_rms_exact(scanner, poses, observations, T_HT=setup.T_HT, t=setup.t)
     turned = float(rotation_angle_between(setup.T_HT.R, calibration.T_HT.R)) * 1e6
     summary, lines = calibration_summary(calibration)
     say.result(
-        {"out": out.name, **summary, "error_t_HT_um": off, "error_R_HT_urad": turned},
+        {"out": out.name, **summary, "error_t_HT_um": off, "error_R_HT_urad": turned,
+         "d_rms_exact_px": found},
         [
             *lines,
             f"  against the simulation's truth: t_HT off by {off[0]:+.2f}, {off[1]:+.2f}, {off[2]:+.2f} um, "
-            f"R_HT by {turned:.2f} urad",
+            f"R_HT by {turned:.2f} urad, detected centres by {found:.5f} px rms",
             f"{out}: radiographs, tables, calibration.json, matrices.npz, geometry/, and report.html to look at",
         ],
     )

@@ -30,6 +30,8 @@ VERBS = (
     "export",
     "import_geometry",
     "reconstruct",
+    "compare",
+    "monitor",
     "report",
     "doctor",
 )

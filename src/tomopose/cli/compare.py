@@ -1,0 +1,44 @@
+"""`tomopose compare`: has the mount changed between two calibrations, and is the change more than chance?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tomopose.cli.common import OK, ForceOption, JsonOption, QuietOption, Say
+
+EPILOG = "Example: tomopose compare before/calibration.json after/calibration.json --out change.html"
+
+
+def register(app: typer.Typer) -> None:
+    app.command("compare", epilog=EPILOG)(compare)
+
+
+def compare(
+    a: Annotated[Path, typer.Argument(help="calibration.json of the earlier run.")],
+    b: Annotated[Path, typer.Argument(help="calibration.json of the later run.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Also write the comparison as one HTML file.")] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """Say what changed from calibration A to calibration B, with its uncertainty and significance (paper, table 2)."""
+    import tomopose as tp
+    from tomopose.files import require_absent
+    from tomopose.report import comparison_report, write_report
+    from tomopose.units import value_with_uncertainty
+
+    say = Say(json=as_json, quiet=quiet)
+    if out is not None:
+        require_absent(out, force=force)
+    found = tp.compare(tp.read_calibration(a), tp.read_calibration(b))
+    if out is not None:
+        write_report(out, comparison_report(found, labels=(str(a), str(b))))
+    changes = [
+        f"  {name:<10} {value_with_uncertainty(float(d), float(u))}   z = {z:+.1f}"
+        for name, d, u, z in zip(found.names, found.difference, found.u, found.z, strict=True)
+    ]
+    say.result({**found.to_json(), "mount_changed": found.mount_changed}, [*found.words, *changes])
+    return OK
