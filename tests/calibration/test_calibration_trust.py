@@ -120,7 +120,7 @@ def test_all_parameters_can_be_freed_with_priors():
     for name, sigma in priors.items():
         assert u[name] <= sigma * (1 + 1e-9), name
     assert u["d_SR"] < 0.08
-    assert u["u_0"] < 0.1
+    assert u["u_0"] < 0.5
 
 
 def test_translation_scale_is_applied_to_a_scan():
