@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from reconstruction_phantom import balls, images_of, scan
 
-from tomopose.errors import ConventionError, InputError, OutOfViewError, ShapeError
+from tomopose.errors import ConventionError, InputError, OutOfViewError
 from tomopose.reconstruction import Correction, LineIntegrals, check_consistency, reconstruct, ring_offset
 from tomopose.volume import VoxelGrid
 
@@ -56,7 +56,7 @@ def test_nan_pixels_are_named_or_excluded():
         assert np.isfinite(found).all()
         assert np.sqrt(((found - clean) ** 2).mean()) < 0.02 * np.ptp(clean)
     broken[8] = np.nan
-    with pytest.raises(InputError, match="image 8: .* unusable"):
+    with pytest.raises(InputError, match=r"image 8: .* unusable"):
         attempt(broken, invalid="exclude")
 
 
@@ -170,5 +170,5 @@ def test_rings_are_taken_out():
     assert abs(np.median(offset[:, 25]) - 0.2) < 0.03
     assert abs(np.median(offset[:, 20])) < 0.03
     clean, ringed = attempt().values, attempt(broken).values
-    cured = attempt(broken, ring_width=15).values
+    cured = attempt(broken, ring_width=5).values
     assert np.sqrt(((cured - clean) ** 2).mean()) < 0.4 * np.sqrt(((ringed - clean) ** 2).mean())

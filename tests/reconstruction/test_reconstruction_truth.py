@@ -78,7 +78,7 @@ def test_cgls_lowers_the_residual_every_time(tilted):
 
 
 def test_nonnegative_and_mask_hold(tilted):
-    z, y, x = np.meshgrid(*(np.arange(n) for n in GRID.shape), indexing="ij")
+    _z, y, x = np.meshgrid(*(np.arange(n) for n in GRID.shape), indexing="ij")
     mask = np.hypot(x - 31.5, y - 31.5) < 30
     truth, volume = truth_of(tilted[1], tilted[0], nonnegative=True, mask=mask, algorithm="sart")
     assert volume.values.min() >= 0

@@ -1,9 +1,9 @@
 """ASTRA toolbox (GPLv3, optional): forward and back-projection on a CUDA GPU through `cone_vec` geometries.
 
 Written against ASTRA's documented interface (create_vol_geom, create_proj_geom 'cone_vec', data3d.link, FP3D_CUDA,
-BP3D_CUDA).  The geometry is tested without a GPU; the kernels themselves need one and are not run by the tests.  ASTRA's
-back-projection is close to the transpose of its forward projection but not equal to it, so that `exact_transpose` is
-False, and it has no 1/w^2 weight, so that FDK is not offered.
+BP3D_CUDA).  The geometry is tested without a GPU; the kernels themselves need one and are not run by the tests.
+ASTRA's back-projection is close to the transpose of its forward projection but not equal to it, so that
+`exact_transpose` is False, and it has no 1/w^2 weight, so that FDK is not offered.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class AstraEngine:
         scale: float = 1.0, nonnegative: bool = False,
     ) -> None:
         if weight not in self.limits.weights:
-            raise InputError(f"engine astra has the weights {', '.join(self.limits.weights)} only; {weight!r} was asked for")
+            raise InputError(f"engine astra has the weight 'mean' only; {weight!r} was asked for")
         total = self.transpose(images, views)
         share = self.transpose(np.ones_like(images, dtype=np.float32), views)
         seen = share > 1e-6 * share.max()

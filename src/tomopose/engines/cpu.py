@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from tomopose.engines import kernels
+from tomopose.engines import kernels, vector
 from tomopose.engines.geometry import index_geometry
 from tomopose.engines.kernels import BORDER, MARGIN, TILE
 from tomopose.engines.protocol import Availability, Limits, Weight, require_images, require_support, require_views
@@ -162,4 +162,4 @@ class CpuEngine:
 
 def availability() -> Availability:
     """The CPU engine needs numba only, which tomopose depends on."""
-    return Availability(name="cpu", available=True, reason=f"{processors()} processors, {kernels.W} lanes a vector")
+    return Availability(name="cpu", available=True, reason=f"{processors()} processors, {vector.W} lanes a vector")

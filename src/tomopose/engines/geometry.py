@@ -43,7 +43,7 @@ def require_usable(matrices: ProjectionMatrices, grid: VoxelGrid) -> None:
         raise OutOfViewError(
             f"the volume reaches behind the source in {behind.size} views (first: view {behind[0]}, depth "
             f"{depth[behind[0]].min():.4g} mm); make the volume smaller or check the unit of the voxel size",
-            indices=behind,
+            indices=behind.tolist(),
         )
     u, v = h[:, 0] / depth, h[:, 1] / depth
     outside = (
@@ -54,11 +54,11 @@ def require_usable(matrices: ProjectionMatrices, grid: VoxelGrid) -> None:
     if missed.size:
         first = missed[0]
         raise OutOfViewError(
-            f"the volume lies outside the field of view in {missed.size} of {len(matrices)} views (first: view {first}, "
-            f"where it would fall on u {u[first].min():.0f} to {u[first].max():.0f}, v {v[first].min():.0f} to "
-            f"{v[first].max():.0f} of {matrices.n_u} x {matrices.n_v} pixels); move or enlarge the grid, or check the "
+            f"the volume lies outside the field of view in {missed.size} of {len(matrices)} views (first: view "
+            f"{first}, where it would fall on u {u[first].min():.0f} to {u[first].max():.0f}, v {v[first].min():.0f} "
+            f"to {v[first].max():.0f} of {matrices.n_u} x {matrices.n_v} pixels); move or enlarge the grid, or check the "
             "matrices",
-            indices=missed,
+            indices=missed.tolist(),
         )
 
 

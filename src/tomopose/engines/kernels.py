@@ -75,8 +75,7 @@ def _back_column_vector(
     z = z_0
     while z < z_1:
         start = min(z, z_1 - W)
-        if start < 0:
-            start = 0  # the column is shorter than a block above z_1: lanes beyond it are cut below
+        start = max(start, 0)  # the column is shorter than a block above z_1: lanes beyond it are cut below
         if start + W > z_1:
             _back_column_plain(column, at, P, x, y, z, z_1, image, row, scale, inverse_square)
             return
@@ -128,7 +127,7 @@ def back_columns(
     the views that see the voxel; `inverse_square` weights each by 1/w^2.  support: flat [x, y, z] without margins, 0
     where a voxel has to stay 0, or empty.
     """
-    n_x, n_y, n_z = shape
+    _n_x, n_y, n_z = shape
     n_u, n_v = detector
     row = n_v + 2 * BORDER
     s_y = n_z + MARGIN
@@ -207,7 +206,7 @@ def _walk(
     volume: Any, start: int, s_k: int, s_a: int, s_b: int, k_0: int, k_1: int, a: float, da: float, b: float, db: float,
 ) -> float:
     """Joseph's sum along one ray, any axis."""
-    total = F32(0.0)
+    total: Any = F32(0.0)
     for k in range(k_0, k_1):
         # + 1.0 keeps the arguments of int() positive: the positions are above -1
         p_a, p_b = a + k * da + 1.0, b + k * db + 1.0
@@ -228,7 +227,7 @@ def forward_columns(
 
     volume: flat, with margins; source, M_inv in voxel indices; spacing: (x, y, z), mm.
     """
-    n_x, n_y, n_z = shape
+    _n_x, n_y, n_z = shape
     s_y = n_z + MARGIN
     s_x = (n_y + MARGIN) * s_y
     strides = (s_x, s_y, 1)
@@ -265,7 +264,7 @@ def forward_columns(
                     rays[2 * W + lane], rays[3 * W + lane] = b + centre * db, db
                 else:
                     first, second = (1 if own == 0 else 0), (1 if own == 2 else 2)
-                    total = F32(0.0)
+                    total: Any = F32(0.0)
                     if high > low:
                         total = _walk(
                             volume, start, strides[own], strides[first], strides[second], low, high, a, da, b, db
@@ -290,9 +289,10 @@ def scatter_planes(
 ) -> None:
     """The exact transpose of `forward_columns` for the rays steepest along `axis`, planes k_start <= k < k_stop.
 
-    Threads own planes, so that no two write to one voxel and the order of additions is fixed.  image: [u, v], no border.
+    Threads own planes, so that no two write to one voxel and the order of additions is fixed.  image: [u, v] without
+    border.
     """
-    n_x, n_y, n_z = shape
+    _n_x, n_y, n_z = shape
     s_y = n_z + MARGIN
     s_x = (n_y + MARGIN) * s_y
     strides = (s_x, s_y, 1)

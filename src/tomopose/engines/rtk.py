@@ -1,8 +1,8 @@
 """itk-rtk (Apache-2.0, optional): an independent CPU implementation, for comparison.
 
 RTK turns its gantry about its y axis: x_R = (y_W, z_W, x_W).  It works in detector millimetres and wants |m3| = 1.
-`AddProjection` answers False, with a warning only, where it refuses a matrix; that answer is checked, as are the numbers
-of views that go in and come out.
+In RTK a ray ends at the centres of the outermost voxels, here at their faces.  `AddProjection` answers False, with a
+warning only, where it refuses a matrix; that answer is checked, as are the numbers of views that go in and come out.
 """
 
 from __future__ import annotations
@@ -104,30 +104,31 @@ class RtkEngine:
     def values(self, state: np.ndarray) -> np.ndarray:
         return state.transpose(1, 2, 0)
 
+    # An ITK view does not keep its array alive: callers hold the array until the filter has run.
+
     def volume_image(self, state: np.ndarray) -> Any:
-        """An ITK image on the array's own memory."""
+        """An ITK image on the memory of a volume."""
         image = self._itk.image_view_from_array(state)
         image.SetOrigin([float(x) for x in R_RTK @ self.grid.origin])
         image.SetSpacing([float(x) for x in R_RTK @ self.grid.spacing])
         return image
 
     def stack_image(self, images: np.ndarray) -> Any:
-        """An ITK image of projections (m, n_v, n_u)."""
-        image = self._itk.image_view_from_array(np.ascontiguousarray(images, dtype=np.float32))
+        """An ITK image on the memory of contiguous float32 projections (m, n_v, n_u)."""
+        image = self._itk.image_view_from_array(images)
         image.SetOrigin([*panel_origin(self.matrices), 0.0])
         image.SetSpacing([self.matrices.p_u, self.matrices.p_v, 1.0])
         return image
 
-    def _run(self, kind: str, base: Any, other: Any, views: Sequence[int], **settings: Any) -> np.ndarray:
-        """Output of a projection filter with two inputs."""
+    def run(self, kind: str, *, volume: np.ndarray, images: np.ndarray, views: Sequence[int], back: bool) -> np.ndarray:
+        """Output of RTK's filter `kind` from a volume and images; back-projectors take the volume first."""
+        images = np.ascontiguousarray(images, dtype=np.float32)
         filters = getattr(self._rtk, kind)[self._kind, self._kind]
         try:
             filtered = filters.New()
-            filtered.SetInput(0, base)
-            filtered.SetInput(1, other)
+            filtered.SetInput(0 if back else 1, self.volume_image(volume))
+            filtered.SetInput(1 if back else 0, self.stack_image(images))
             filtered.SetGeometry(rtk_geometry(self.matrices, views))
-            for name, value in settings.items():
-                getattr(filtered, f"Set{name}")(value)
             filtered.Update()
         except RuntimeError as error:
             raise EngineFailedError(f"RTK failed in {kind}: {str(error).strip().splitlines()[-1]}") from error
@@ -135,15 +136,15 @@ class RtkEngine:
 
     def forward(self, state: np.ndarray, views: Sequence[int]) -> np.ndarray:
         shape = (len(views), self.matrices.n_v, self.matrices.n_u)
-        images = self._run(
-            "JosephForwardProjectionImageFilter", self.stack_image(np.zeros(shape)), self.volume_image(state), views
+        images = self.run(
+            "JosephForwardProjectionImageFilter", volume=state, images=np.zeros(shape), views=views, back=False
         )
         return require_returned(images, shape, self.name)
 
     def transpose(self, images: np.ndarray, views: Sequence[int]) -> np.ndarray:
         images = require_images(images, views, self.matrices)
-        volume = self._run(
-            "JosephBackProjectionImageFilter", self.volume_image(self.empty()), self.stack_image(images), views
+        volume = self.run(
+            "JosephBackProjectionImageFilter", volume=self.empty(), images=images, views=views, back=True
         )
         return require_returned(volume, self.empty().shape, self.name)
 
@@ -174,7 +175,7 @@ class RtkEngine:
             geometry = rtk_geometry(self.matrices, views)
             square = np.array(geometry.GetSourceToIsocenterDistances()) ** 2
             images = images / square[:, None, None].astype(np.float32)
-        volume = self._run(kind, self.volume_image(self.empty()), self.stack_image(images), views)
+        volume = self.run(kind, volume=self.empty(), images=images, views=views, back=True)
         return require_returned(volume, self.empty().shape, self.name)
 
     def lengths(self, views: Sequence[int]) -> np.ndarray:

@@ -11,10 +11,14 @@ from __future__ import annotations
 from typing import Any
 
 import llvmlite.binding
-import llvmlite.ir as ir
+from llvmlite import ir
 from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
+from numba.core import cgutils as untyped_cgutils
+from numba.extending import intrinsic as untyped_intrinsic
+
+# numba is typed in parts only; what a checker would take from those parts is wrong for code generation.
+cgutils: Any = untyped_cgutils
+intrinsic: Any = untyped_intrinsic
 
 F32, I32, I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 
@@ -89,7 +93,7 @@ def _bilinear(builder: Any, data: Any, base: Any, row: Any, a: Any, b: Any) -> A
 
 
 def _back_block(inverse_square: bool) -> Any:
-    @intrinsic  # type: ignore[misc]
+    @intrinsic
     def block(
         typingctx: Any, column: Any, z: Any, image: Any, base: Any, row: Any, first: Any, scale: Any,
         u: Any, du: Any, v: Any, dv: Any, w: Any, dw: Any,
@@ -136,7 +140,7 @@ back_block = _back_block(inverse_square=False)
 back_block_inverse_square = _back_block(inverse_square=True)
 
 
-@intrinsic  # type: ignore[misc]
+@intrinsic
 def forward_block(
     typingctx: Any, volume: Any, base: Any, plane: Any, row: Any, rays: Any, k_0: Any, k_1: Any, centre: Any,
     a_end: Any, b_end: Any, sums: Any, at: Any,

@@ -68,7 +68,7 @@ def _grid(shape: Any, spacing: Any, origin: Any) -> VoxelGrid:
     return VoxelGrid(shape=(n_z, n_y, n_x), spacing=spacing, centre=centre)
 
 
-# -- HDF5 -----------------------------------------------------------------------------------------------------------------
+# -- HDF5 -----------------------------------------------------------------------------------------------------------
 
 
 def _write_hdf5(volume: Volume, path: Path) -> None:
@@ -110,7 +110,7 @@ def _read_hdf5(path: Path) -> Volume:
     )
 
 
-# -- TIFF -----------------------------------------------------------------------------------------------------------------
+# -- TIFF -----------------------------------------------------------------------------------------------------------
 
 
 def _write_tiff(volume: Volume, path: Path) -> None:
@@ -141,7 +141,7 @@ def _read_tiff(path: Path) -> Volume:
     )
 
 
-# -- NRRD (teem.sourceforge.net/nrrd/format.html) and MetaImage (itk.org/Wiki/ITK/MetaIO/Documentation) ------------------------
+# -- NRRD (teem.sourceforge.net/nrrd/format.html) and MetaImage (itk.org/Wiki/ITK/MetaIO/Documentation) ----------------
 
 
 def _numbers(values: Any) -> list[str]:

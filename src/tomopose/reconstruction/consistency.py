@@ -20,7 +20,7 @@ from tomopose.reconstruction.order import view_order
 from tomopose.volume import VoxelGrid
 
 VIEWS, PIXELS, VOXELS, SWEEPS = 60, 96, 56, 2
-"""Size of the coarse reconstruction: views, detector pixels and voxels along the longest edge, sweeps over the views."""
+"""The coarse reconstruction: views, detector pixels and voxels along the longest edge, sweeps over the views."""
 CLEARLY = 1.5
 """A reading counts as better where it leaves a residual smaller by this factor."""
 SUSPICIOUS = 6.0
@@ -28,8 +28,10 @@ SUSPICIOUS = 6.0
 
 READINGS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
     "as given": (lambda p: p, ""),
-    "rows flipped": (lambda p: p[:, ::-1], "row 0 of the images is the top; flip them (image[::-1]) or open them with "
-                     'image_rows="top-first"'),
+    "rows flipped": (
+        lambda p: p[:, ::-1],
+        'row 0 of the images is the top; flip them (image[::-1]) or open them with image_rows="top-first"',
+    ),
     "columns mirrored": (lambda p: p[:, :, ::-1], "mirror the images (image[:, ::-1])"),
     "turned by 180 degrees": (lambda p: p[:, ::-1, ::-1], "turn the images (image[::-1, ::-1])"),
     "rows and columns exchanged": (lambda p: p.transpose(0, 2, 1), "transpose the images (image.T)"),

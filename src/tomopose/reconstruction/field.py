@@ -6,6 +6,7 @@ is linear and a slab's margin is zero; back-projection touches each voxel once.
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -113,7 +114,7 @@ class Piece:
 def slab_bounds(n_z: int, slabs: int) -> tuple[tuple[int, int], ...]:
     """`slabs` runs of layers of nearly equal thickness."""
     edges = np.linspace(0, n_z, slabs + 1).round().astype(int)
-    return tuple((int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a)
+    return tuple((int(a), int(b)) for a, b in itertools.pairwise(edges) if b > a)
 
 
 class DiskField:

@@ -66,13 +66,15 @@ def images_kind(images: Any, images_are: ImagesAre | None) -> ImagesAre:
     return images_are if images_are is not None else own  # type: ignore[return-value]
 
 
-def hole_filler(bad: np.ndarray) -> scipy.sparse.csr_array:
+def hole_filler(bad: np.ndarray) -> Any:
     """(n_bad, n_pixels): each bad pixel as the mean of the good ones in the smallest window that holds at least three.
 
     InputError where a hole is wider than `LARGEST_HOLE`.
     """
     n_v, n_u = bad.shape
-    rows, columns, values = [], [], []
+    rows: list[int] = []
+    columns: list[int] = []
+    values: list[float] = []
     for i, (v, u) in enumerate(np.argwhere(bad)):
         for half in range(1, LARGEST_HOLE // 2 + 1):
             window = np.s_[max(0, v - half) : v + half + 1, max(0, u - half) : u + half + 1]
@@ -87,7 +89,11 @@ def hole_filler(bad: np.ndarray) -> scipy.sparse.csr_array:
         rows += [i] * len(good)
         columns += [int(a) * n_u + int(b) for a, b in good]
         values += [1 / len(good)] * len(good)
-    return scipy.sparse.csr_array((values, (rows, columns)), shape=(int(bad.sum()), n_u * n_v), dtype=np.float32)
+    operator: Any = scipy.sparse.coo_matrix(
+        (np.array(values), (np.array(rows, dtype=np.intp), np.array(columns, dtype=np.intp))),
+        shape=(int(bad.sum()), n_u * n_v),
+    )
+    return operator.tocsr().astype(np.float32)
 
 
 class LineIntegrals:
@@ -139,12 +145,14 @@ class LineIntegrals:
             else:
                 factors = [f for f in range(2, 9) if image.shape == (expected[0] // f, expected[1] // f)]
                 hint = f"; the images look binned: use matrices.binned({factors[0]})" if factors else ""
-            raise ShapeError(f"wrong size: image {j} is {image.shape}, the matrices are for {expected} (n_v, n_u){hint}")
+            raise ShapeError(
+                f"wrong size: image {j} is {image.shape}, the matrices are for {expected} (n_v, n_u){hint}"
+            )
         if image.dtype.kind not in "uif":
             raise InputError(f"image {j} holds {image.dtype}; real numbers are needed")
         return image
 
-    def view(self, j: int) -> tuple[np.ndarray, np.ndarray, scipy.sparse.csr_array]:
+    def view(self, j: int) -> tuple[np.ndarray, np.ndarray, Any]:
         """(line integrals, which pixels have no say, the operator that fills those from their neighbours)."""
         image = self.raw(j).astype(np.float32)
         kind = self.correction.images_are
@@ -191,15 +199,15 @@ def require_contrast(scan: LineIntegrals, probe: Sequence[int]) -> None:
     ranges = [scan.contrast(j) for j in probe]
     if max(ranges) < 1e-3:
         raise InputError(
-            f"no contrast: line integrals vary by {max(ranges):.2g} at most over {len(ranges)} views looked at; are these "
-            "radiographs of an object, and is images_are right?"
+            f"no contrast: line integrals vary by {max(ranges):.2g} at most over {len(ranges)} views looked at; are "
+            "these radiographs of an object, and is images_are right?"
         )
     if scan.correction.images_are == "transmission":
         darkest = max(float(-np.percentile(scan[j][::2, ::2], 0.5)) for j in probe)
         if darkest > np.log(10.0):
             raise InputError(
-                f"transmissions reach {np.exp(darkest):.4g}, above 10: these look like counts; pass images_are=\"counts\" "
-                "with white=..."
+                f"transmissions reach {np.exp(darkest):.4g}, above 10: these look like counts; pass "
+                'images_are="counts" with white=...'
             )
 
 
@@ -219,8 +227,8 @@ def linearised(p: np.ndarray, coefficients: Sequence[float], j: int) -> np.ndarr
 
 
 def beam_hardening_polynomial(
-    energies_keV: Any, fluence: Any, attenuation_per_mm: Any, *, thickness_mm: float, reference_keV: float | None = None,
-    degree: int = 3,
+    energies_keV: Any, fluence: Any, attenuation_per_mm: Any, *, thickness_mm: float,
+    reference_keV: float | None = None, degree: int = 3,
 ) -> tuple[float, ...]:
     """Coefficients c_1 ... of the polynomial that takes polychromatic line integrals of one material to monochromatic.
 

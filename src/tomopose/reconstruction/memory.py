@@ -14,7 +14,7 @@ from tomopose.volume import VoxelGrid
 
 GIB = 2**30
 IMAGE_COPIES = 8
-"""float32 images alive for each view of a subset: two subsets read ahead, reprojection, lengths, bordered copy, work."""
+"""float32 images alive for each view of a subset: this one, the next, reprojection, lengths, bordered copy, work."""
 BASE = 0.35 * GIB
 """Python, numpy, numba and the compiled kernels."""
 SAMPLED_PIXELS = 192
@@ -23,7 +23,7 @@ SAMPLED_PIXELS = 192
 
 @dataclass(frozen=True, kw_only=True)
 class MemoryPlan:
-    """volume_bytes, images_bytes: needed in one piece; slabs: 1 where that fits; disk_bytes: read and written in all."""
+    """volume_bytes, images_bytes: needed in one piece; slabs: 1 where that fits; disk_bytes: read and written."""
 
     volume_bytes: int
     images_bytes: int
@@ -98,8 +98,8 @@ def memory_plan(
         edge = int((max(room, 0.0) / (4 * per_voxel)) ** (1 / 3)) - MARGIN
         raise InputError(
             f"too little memory: {plan.in_one_piece / GIB:.2f} GiB are needed for {grid.shape[2]} x {grid.shape[1]} x "
-            f"{grid.shape[0]} voxels, {(limit or 0) / GIB:.2f} GiB are there; {max(edge, 1)}^3 voxels would fit, or pass "
-            "scratch=FOLDER to work in slabs on disk"
+            f"{grid.shape[0]} voxels, {(limit or 0) / GIB:.2f} GiB are there; {max(edge, 1)}^3 voxels would fit, or "
+            "pass scratch=FOLDER to work in slabs on disk"
         )
     slabs = math.ceil(grid.shape[0] / layers)
     updates = math.ceil(n / subset_size) * passes

@@ -1,4 +1,4 @@
-"""What kind of path the source takes about the object: circular or not, how much of a turn, and the weight of each view."""
+"""The path of the source about the object: circular or not, how much of a turn, and the weight of each view."""
 
 from __future__ import annotations
 

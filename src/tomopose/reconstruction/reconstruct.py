@@ -176,7 +176,8 @@ def reconstruct(
                 schedule.append((update, subsets(sequence, int(size))))
         keeper = None
         if checkpoint is not None:
-            identity = fingerprint(matrices, grid, {**settings, "order": sequence.tolist(), "mask": mask_digest(support)})
+            exact = {**settings, "order": sequence.tolist(), "mask": mask_digest(support)}
+            identity = fingerprint(matrices, grid, exact)
             keeper = Checkpoint(Path(checkpoint), identity, seconds=checkpoint_seconds)
         run(schedule, field, scan, samples=samples, checkpoint=keeper, progress=progress)
         residual = view_residuals(field, scan, samples)
@@ -228,14 +229,14 @@ def path_notes(matrices: ProjectionMatrices, grid: VoxelGrid, path: SourcePath) 
     notes = []
     if not path.full_turn:
         notes.append(
-            f"short scan: the source covers {math.degrees(path.coverage):.0f} of 360 degrees about the object; FDK is not "
-            "used, and SART cannot replace what no view shows"
+            f"short scan: the source covers {math.degrees(path.coverage):.0f} of 360 degrees about the object; FDK is "
+            "not used, and SART cannot replace what no view shows"
         )
     beside = truncated_views(matrices, grid)
     if beside.size:
         notes.append(
-            f"truncated: corners of the grid fall beside the detector in {beside.size} of {len(matrices)} views; what the "
-            "grid does not hold but the rays cross is smeared into it"
+            f"truncated: corners of the grid fall beside the detector in {beside.size} of {len(matrices)} views; what "
+            "the grid does not hold but the rays cross is smeared into it"
         )
     return notes
 
