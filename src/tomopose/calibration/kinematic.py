@@ -18,7 +18,13 @@ from tomopose.calibration.kinematic_fit import ModelFit, fit_model
 from tomopose.calibration.kinematic_solve import KinematicProblem, State, singular_values
 from tomopose.calibration.model_choice import EVIDENCE_GAIN, Judgement, better, by_rotation, judge
 from tomopose.calibration.multi_ball import require_balls_not_swapped
-from tomopose.calibration.parameters import FreeParameters, adjusted_scanners, free_parameters, unit_of
+from tomopose.calibration.parameters import (
+    FreeParameters,
+    adjusted_scanners,
+    free_parameters,
+    translation_scale,
+    unit_of,
+)
 from tomopose.calibration.problem import Problem, pair
 from tomopose.calibration.result import Calibration, Observability, Parameter
 from tomopose.calibration.run_changes import change_in_words, find_change, require_same_pivot
@@ -72,7 +78,7 @@ def calibrate_kinematic(
     rigid:        the calibration that trusts the poses: start, and the answer if auto finds no better.
     manipulator:  Hexapod, SerialRobot, content or path of hexapod.json or robot.json; None for "slack".
     model:        "kinematic": the machine's errors; "slack": scatter and a smooth map of pose errors, for machines
-                  whose kinematics nobody knows; "rigid": none; "auto": kinematic where evidence and held-out poses both say
+                  whose kinematics nobody knows; "rigid": none; "auto": kinematic if evidence and held-out poses say
                   that it is better, else rigid.
     free:         freed scanner parameters with priors; by default those of the rigid calibration.
     distances:    (ball id, ball id) -> (distance, standard uncertainty), mm: scale bars.
@@ -293,6 +299,8 @@ def _calibration(
         m = len(model.names)
         u = np.sqrt(np.diag(e.covariance))[before : before + m]
         block = manipulator_block(model, e.state.p[:m], u, problem.poses)
+        scale = translation_scale(problem.free, e.state.delta)
+        block |= {"translation_scale": scale} if scale != 1.0 else {}
         gamma = m - float(np.sum((u / model.sigma) ** 2))
         notes.append(
             f"the radiographs determine {gamma:.1f} of {m} errors of the manipulator; the others, and shifts and turns "

@@ -74,10 +74,7 @@ def trajectory_jacobian(calibration: Calibration, poses: PoseSequence, points: A
     mm, in H.  `poses` are the commanded ones; identified errors of the manipulator are applied here.
     """
     scanner, names, R_HT = calibration.scanner, calibration.tangent, calibration.T_HT.R
-    block = calibration.manipulator
-    scale = float(block.get("translation_scale", 1.0))
-    scale += sum(p.value - 1.0 for p in calibration.parameters if p.name == "translation_scale" and "kind" in block)
-    fixed = correction(block, poses)
+    fixed = correction(calibration.manipulator, poses)
     T_MH = fixed.poses.T_MH
     x = np.asarray(points, dtype=np.float64)
     x_M = (scanner.T_TW(0.0).inv.apply(x) - calibration.T_HT.t) @ R_HT
@@ -88,10 +85,8 @@ def trajectory_jacobian(calibration: Calibration, poses: PoseSequence, points: A
     freed = [(j, name.split("[")[0]) for j, name in enumerate(names)]
     errors = [names.index(name) for name in fixed.names]
     for i in range(m):
-        b = projection_blocks(
-            scanner, T_HT=calibration.T_HT, T_MH=T_MH, t=x_M[i], alpha=poses.alpha, translation_scale=scale
-        )
-        J_pose[:, i] = np.concatenate([-b.G_H @ skew(b.x_H - scale * T_MH.t), scale * b.G_H], axis=2)
+        b = projection_blocks(scanner, T_HT=calibration.T_HT, T_MH=T_MH, t=x_M[i], alpha=poses.alpha)
+        J_pose[:, i] = np.concatenate([-b.G_H @ skew(b.x_H - T_MH.t), b.G_H], axis=2)
         rigid_pose[:, i] = np.concatenate([-b.J_t @ skew(x_M[i]), b.J_t], axis=2)
         J[:, i, :, :6] = b.J_mount
         J[:, i, :, errors] = np.moveaxis(J_pose[:, i] @ fixed.J, 2, 0)

@@ -4,6 +4,7 @@
 
     {"kind": "hexapod" | "serial" | "map",  "nominal": the machine as in its file,
      "names", "values", "units", "u": of its errors,
+     "translation_scale": factor on the plate's shifts, where it was freed and is not 1,
      "range": {"t_mm": [low (3), high (3)], "w_rad": [low, high]}: of the calibration's poses}
 
 Home of eq. (5) stays the identity: M is the frame that equals H when the controller's zero pose is executed without
@@ -113,6 +114,9 @@ def correction(manipulator: Mapping[str, Any], poses: PoseSequence) -> Correctio
         return Correction(poses=poses, J=np.zeros((n, 6, 0)), names=(), outside=np.zeros(n, dtype=bool))
     model, p = model_from_block(manipulator)
     real = model.real_poses(poses, p)
+    scale = float(manipulator.get("translation_scale", 1.0))
+    T_MH = replace(real.T_MH, t=scale * real.t)
+    J = np.concatenate([real.J[:, :3], scale * real.J[:, 3:]], axis=1)
     outside = _outside(manipulator["range"], poses)
     notes: tuple[str, ...] = ()
     if outside.any():
@@ -121,7 +125,7 @@ def correction(manipulator: Mapping[str, Any], poses: PoseSequence) -> Correctio
             f"{int(outside.sum())} of {n} poses lie outside the range in which the manipulator's errors were "
             f"identified, the first is {poses.pose_id[first]!r}; there the correction rests on the model alone",
         )
-    return Correction(poses=replace(poses, T_MH=real.T_MH), J=real.J, names=model.names, outside=outside, notes=notes)
+    return Correction(poses=replace(poses, T_MH=T_MH), J=J, names=model.names, outside=outside, notes=notes)
 
 
 def corrected_poses(manipulator: Mapping[str, Any], poses: PoseSequence) -> PoseSequence:
