@@ -1,0 +1,137 @@
+"""`tomopose plan poses`: the paper's grid, or the best poses for a scan, with the machine's own command lists."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tomopose.cli.common import OK, ForceOption, JsonOption, QuietOption, Say, names
+
+if TYPE_CHECKING:
+    from tomopose import PoseSequence, Scanner
+
+EPILOG = "Example: tomopose plan poses --scanner scanner.json --optimal --table-angles-deg 0,90 --out poses.csv"
+
+SUFFIXES = {"pi-gcs": ".gcs", "kuka-krl": ".src", "abb-rapid": ".mod", "ur-script": ".script"}
+
+
+def numbers(text: str, option: str) -> tuple[float, ...]:
+    """`0,90` as numbers."""
+    try:
+        return tuple(float(part) for part in names(text))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is no list of numbers", param_hint=option) from None
+
+
+def require_ball_in_view(scanner: Scanner, sequence: PoseSequence, ball_diameter: float) -> None:
+    """OutOfViewError where the ball leaves the panel.  The mount is known only roughly: pivot and ball on the axis."""
+    import numpy as np
+
+    from tomopose.errors import OutOfViewError
+    from tomopose.planning.design import nominal_mount
+    from tomopose.trajectory.feasibility import ball_in_view
+
+    seen = ball_in_view(scanner, T_HT=nominal_mount(), poses=sequence, t=np.zeros(3), radius=ball_diameter / 2)
+    bad = np.flatnonzero(~seen)
+    if bad.size:
+        raise OutOfViewError(
+            f"in {bad.size} of {len(sequence)} poses the ball leaves the field of view, first in pose "
+            f"{sequence.pose_id[int(bad[0])]!r}; reduce --half-range-mm or the magnification",
+            indices=bad.tolist(),
+        )
+
+
+def best_poses(
+    scanner: Scanner, *, half_range: float, tilt: float, table_angles: tuple[float, ...], ball_diameter: float,
+    images: int | None, goal: float | None,
+) -> Any:
+    """The plan that tells a tilted scan's matrices best, within the given travel (mm, deg) and table angles (deg)."""
+    from tomopose.planning.design import plan_poses
+    from tomopose.planning.limits import PlanLimits
+    from tomopose.trajectory.feasibility import TravelLimits
+
+    angle = math.radians(tilt)
+    travel = TravelLimits.symmetric(x=half_range, y=half_range, z=half_range, rx=angle, ry=angle, rz=angle)
+    limits = PlanLimits(
+        travel=travel, table_angles=tuple(math.radians(a) for a in table_angles), ball_radius=ball_diameter / 2
+    )
+    return plan_poses(scanner, n=images, goal=goal, limits=limits)
+
+
+def poses(
+    out: Annotated[Path, typer.Option("--out", help="poses.csv to write.")],
+    grid: Annotated[int, typer.Option("--grid", min=1, help="Positions along each axis; 3 is the paper's plan.")] = 3,
+    optimal: Annotated[
+        bool, typer.Option("--optimal", help="Instead of the grid: the poses that serve a tilted scan best.")
+    ] = False,
+    images: Annotated[
+        int | None, typer.Option("--images", help="With --optimal: how many; default as few as equal the paper's 189.")
+    ] = None,
+    goal: Annotated[
+        float | None, typer.Option("--goal-px", help="With --optimal: scan reprojection error to reach, px rms.")
+    ] = None,
+    half_range: Annotated[float, typer.Option("--half-range-mm", help="How far the positions reach, mm.")] = 10.0,
+    tilt: Annotated[float, typer.Option("--tilt-deg", help="Largest rotation about each axis, degrees.")] = 5.0,
+    table_angles: Annotated[
+        str, typer.Option("--table-angles-deg", help="Table angles to use; 0,90 shows what 0 alone cannot.")
+    ] = "0",
+    scanner: Annotated[
+        Path | None, typer.Option("--scanner", help="scanner.json; refuses poses that put the ball out of view.")
+    ] = None,
+    ball_diameter: Annotated[float, typer.Option("--ball-diameter-mm", help="For the field of view, mm.")] = 8.0,
+    commands: Annotated[
+        str | None,
+        typer.Option("--commands", help="Also write the machine's own list: pi-gcs, kuka-krl, abb-rapid or ur-script."),
+    ] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """Write calibration poses: the paper's grid n x n x n x 7 (fig. 5), or an optimal plan with its predicted error.
+
+    An optimal plan says what uncertainty to expect before a single image is taken, and which mistakes it would show.
+    """
+    import tomopose as tp
+    from tomopose.files import require_absent, write_text
+    from tomopose.planning.commands import command_list
+
+    say = Say(json=as_json, quiet=quiet)
+    angles = numbers(table_angles, "--table-angles-deg")
+    if commands is not None and commands not in SUFFIXES:
+        raise typer.BadParameter(f"{commands!r} is none of {', '.join(SUFFIXES)}", param_hint="--commands")
+    require_absent(out, force=force)
+    listing = None if commands is None else require_absent(out.with_suffix(SUFFIXES[commands]), force=force)
+    geometry = None if scanner is None else tp.read_scanner(scanner)
+    summary: dict[str, Any] = {"out": out.name}
+    lines: list[str] = []
+    if optimal:
+        if geometry is None:
+            raise typer.BadParameter("an optimal plan needs the scanner", param_hint="--scanner")
+        plan = best_poses(
+            geometry, half_range=half_range, tilt=tilt, table_angles=angles, ball_diameter=ball_diameter,
+            images=images, goal=goal,
+        )
+        sequence = plan.poses
+        summary |= {"predicted_px": plan.predicted, "paper_189_px": plan.reference, "u": dict(plan.u),
+                    "duration_s": plan.duration}
+        lines.append(
+            f"  predicted scan reprojection error {plan.predicted:.4f} px (the paper's 189 poses: "
+            f"{plan.reference:.4f} px), about {plan.duration / 60:.0f} minutes"
+        )
+    else:
+        sequence = tp.pose_grid(
+            grid, half_range=half_range, tilt=math.radians(tilt), table_angles=[math.radians(a) for a in angles]
+        )
+        if geometry is not None:
+            require_ball_in_view(geometry, sequence, ball_diameter)
+    tp.write_poses(out, sequence, force=force)
+    if commands is not None and listing is not None:
+        write_text(listing, command_list(sequence, commands))
+        lines.append(f"  {listing}: the same poses as {commands}")
+    say.result({**summary, "poses": len(sequence)}, [f"{out}: {len(sequence)} poses", *lines])
+    if len(angles) == 1:
+        say.note("note: one table angle leaves d_SR, u_0 and the detector's roll unknown; see --table-angles-deg")
+    return OK
