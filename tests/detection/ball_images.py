@@ -180,3 +180,28 @@ def cramer_rao(scene: Scene, box: dict[str, int], snr: float) -> Array:
     J = derivatives(scene, box).reshape(6, -1)
     variance = np.maximum(noise_free(scene, **box).ravel(), 1e-6) / snr**2
     return np.linalg.inv((J / variance) @ J.T)[:2, :2]
+
+
+def frame(scene: Scene, *, extra: Array | None = None, margin: float = 2.0) -> Array:
+    """Noise-free full frame: the scene near the ball, transmission 1 elsewhere, times `extra` (n_v, n_u)."""
+    s = scene.scanner
+    image = np.ones(s.shape)
+    box = window(scene, margin)
+    u0, v0 = max(box["u"], 0), max(box["v"], 0)
+    u1, v1 = min(box["u"] + box["n_u"], s.n_u), min(box["v"] + box["n_v"], s.n_v)
+    image[v0:v1, u0:u1] = noise_free(scene, u=u0, v=v0, n_u=u1 - u0, n_v=v1 - v0)
+    return image if extra is None else image * extra
+
+
+def scene_of(
+    *, radius_px: float, u: float, v: float, n: int = 1024, pitch: tuple[float, float] = (0.2, 0.2), **change: object
+) -> Scene:
+    """An 8 mm ball whose silhouette has about that radius, centred at (u, v) of an n x (n - 23) detector."""
+    p = float(np.sqrt(pitch[0] * pitch[1]))
+    d_SR = min(4.0 * 1500.0 / (radius_px * p), 1499.0)
+    diameter = 2 * radius_px * p * d_SR / 1500.0
+    scanner = Scanner(d_SD=1500.0, d_SR=d_SR, p_u=pitch[0], p_v=pitch[1], u_0=0.49 * n, v_0=0.53 * n, n_u=n, n_v=n - 23)
+    size = diameter / 8.0
+    values: dict[str, object] = {"radius": diameter / 2, "tube_inner": 4.0 * size, "tube_outer": 6.0 * size,
+                                 "mu_tube": PEEK / size}
+    return Scene(scanner=scanner, centre=centre_at(scanner, u, v, d_SR), **{**values, **change})  # type: ignore[arg-type]

@@ -30,7 +30,7 @@ MISFIT = 6.0
 SMALLEST_BLUR, LARGEST_STEP = 0.25, 2.0
 STEEPEST = 6.0
 """Prior: the background changes over the ring by no more than this many standard deviations of the ring's values."""
-KAPPA_STARTS = (0.4, 1.5, 4.0)
+KAPPA_STARTS = (0.3, 1.0, 3.0, 8.0)
 """Total attenuations along the diameter from which a ball that X-rays pass is fitted; below the first the shape of
 the profile no longer depends on it."""
 
@@ -44,6 +44,7 @@ class ConeFit:
     level, white: mean background level and the ball's own; noise_out, noise_in: standard deviations there.
     chi2_dof: with the noise of the background; rho: autocorrelation of the noise.
     visible: share of the rim with pixels; lost: share of the visible rim's pixels left out as bad or outlying;
+    rim_rms: residual on the rim, in the image's values.
     misfit: share of the rim where a holder's edge makes the background outside fit badly.
     """
 
@@ -59,6 +60,7 @@ class ConeFit:
     visible: float
     lost: float
     misfit: float
+    rim_rms: float
     anisotropy: Array
     anisotropy_covariance: Array
 
@@ -143,8 +145,11 @@ class _Rim:
         g[i] -= self.precision * (self.nodes - centre).ravel()
         return N[np.ix_(active, active)], g[active]
 
-    def step(self, active: npt.NDArray[np.intp]) -> float:
-        """One Gauss-Newton step; returns the largest move of centre and radius, px."""
+    def step(self, active: npt.NDArray[np.intp], *, careful: bool = False) -> float:
+        """One Gauss-Newton step, shortened while it makes the fit worse if `careful`.
+
+        Returns the largest move of centre and radius, px.
+        """
         N, g = self.normal(active)
         delta = solve(N, g[:, None])[:, 0]
         full = np.zeros(FIRST_NODE + 3 * self.n_nodes)
@@ -154,6 +159,21 @@ class _Rim:
             full[:N_SHAPE] *= LARGEST_STEP / largest
         if not np.isfinite(full).all():
             raise BallNotFoundError("the rim does not determine a ball (no finite step)")
+        before = (self.shape, self.white, self.nodes)
+        cost = self.cost
+        self._move(full, active)
+        while careful and self.cost > cost and np.abs(full[:3]).max() > 1e-3:
+            full = full / 3
+            self.shape, self.white, self.nodes = before
+            self._move(full, active)
+        return largest
+
+    @property
+    def cost(self) -> float:
+        return float((self.weight * self.residual**2).sum())
+
+    def _move(self, full: Array, active: npt.NDArray[np.intp]) -> None:
+        """Adds `full` to the parameters, within their bounds."""
         s = self.shape.copy()
         s[active[active < N_SHAPE]] += full[active[active < N_SHAPE]]
         s[3] = np.clip(s[3], max(SMALLEST_BLUR, self.shape[3] / 2), min(self.shape[3] * 2, 0.45 * s[2]))
@@ -163,7 +183,6 @@ class _Rim:
         self.white += full[WHITE]
         self.nodes = self.nodes + full[FIRST_NODE:].reshape(-1, 3)
         self.evaluate()
-        return largest
 
     def active(self, *shape: str, curvature: bool = True) -> npt.NDArray[np.intp]:
         use = np.zeros(FIRST_NODE + 3 * self.n_nodes, dtype=bool)
@@ -206,24 +225,27 @@ def fit_cone(
     if not spread > 0:
         raise BallNotFoundError(f"the image is constant around ({x_D[0]:.1f}, {x_D[1]:.1f})")
     floor = quantum**2 / 12 + (1e-5 * spread) ** 2
+    start = rim.shape.copy()
     _approach(rim, spread)
     kappa_free = _is_transparent(rim)
     shape: tuple[str, ...] = ("u", "v", "radius", "sigma")
     if kappa_free:
-        _choose_kappa(rim, spread)
+        _choose_kappa(rim, spread, start)
         shape = (*shape, "kappa")
     rim.outside = rim.reach
     rim.gather()
-    rim.weight = np.full(rim.u.size, 1.0 / (0.03 * spread) ** 2)
-    rim.evaluate()
-    rim.step(rim.active(curvature=False))
+    _robust_background(rim, spread)
+    if kappa_free:
+        for _ in range(10):
+            if rim.step(rim.active(*shape, curvature=False), careful=True) < 1e-3:
+                break
     active = rim.active(*shape)
     for turn in range(3):
-        v_low, v_high, excess = _weigh(rim, floor, 2.0 if turn == 0 else 2.5)
+        v_in, v_out, excess = _weigh(rim, floor, 2.0 if turn == 0 else 2.5)
         widest = (rim.reach**2 / (STEEPEST * spread)) ** 2
         rim.precision[2::3] = widest if turn < 1 else np.maximum(_curvature_precision(rim, active), widest)
-        for _ in range(1 if turn < 2 else 4):
-            if rim.step(active) < 1e-4:
+        for _ in range(3 if kappa_free else 1 if turn < 2 else 4):
+            if rim.step(active, careful=kappa_free) < 1e-4:
                 break
     anisotropy, anisotropy_covariance = _anisotropy(rim, shape)
     significance = float(anisotropy @ np.linalg.solve(anisotropy_covariance, anisotropy))
@@ -233,7 +255,7 @@ def fit_cone(
         for _ in range(3):
             rim.step(active)
         anisotropy = rim.shape[5:7].copy()
-    return _result(rim, shape, active, (v_low, v_high), excess, anisotropy, anisotropy_covariance)
+    return _result(rim, shape, active, (v_in, v_out), excess, anisotropy, anisotropy_covariance)
 
 
 def _approach(rim: _Rim, spread: float) -> None:
@@ -258,6 +280,23 @@ def _approach(rim: _Rim, spread: float) -> None:
         rim.weight = np.where(out, 0.0, 1.0 / (0.03 * spread) ** 2)
 
 
+def _robust_background(rim: _Rim, spread: float) -> None:
+    """The background over the whole ring; dead lines and hot pixels, if there are any, get little weight (Cauchy)."""
+    equal = np.full(rim.u.size, 1.0 / (0.03 * spread) ** 2)
+    rim.weight = equal
+    rim.evaluate()
+    active = rim.active(curvature=False)
+    rim.step(active)
+    away = np.abs(rim.rim[:, 0]) > 3.0
+    for _ in range(6):
+        scale = 1.4826 * float(np.median(np.abs(rim.residual[away]))) + 1e-9 * spread
+        x = np.where(away, rim.residual / (3.0 * scale), 0.0)
+        if np.abs(x).max() < 3.0:
+            break
+        rim.weight = equal / (1.0 + x**2) ** 2
+        rim.step(active)
+
+
 def _is_transparent(rim: _Rim) -> bool:
     """Whether the ball grows darker towards its middle by more than noise and 1 % of its contrast."""
     depth = 3 * rim.shape[3] + 0.5
@@ -279,24 +318,23 @@ def _is_transparent(rim: _Rim) -> bool:
     return abs(near - deep) > max(0.01 * abs(rim.level - deep), 6 * math.hypot(u_near, u_deep))
 
 
-def _choose_kappa(rim: _Rim, spread: float) -> None:
+def _choose_kappa(rim: _Rim, spread: float, start: Array) -> None:
     """Widens the ring inwards and takes the best of several starts for the total attenuation."""
-    radius = rim.shape[2]
-    rim.inside = float(min(max(0.35 * radius, 3 * rim.shape[3] + 2.0), 14.0, radius - 0.5))
+    radius = start[2]
+    rim.shape = start.copy()
+    rim.inside = float(min(max(0.12 * radius, 3 * start[3] + 3.0), 10.0, radius - 0.5))
     rim.gather()
     rim.weight = np.full(rim.u.size, 1.0 / (0.03 * spread) ** 2)
-    start = (rim.shape.copy(), rim.nodes.copy(), rim.white)
     best = None
     for kappa in KAPPA_STARTS:
-        rim.shape, rim.nodes, rim.white = start[0].copy(), start[1].copy(), start[2]
+        rim.shape, rim.nodes, rim.white = start.copy(), np.zeros_like(rim.nodes), 0.0
         rim.shape[4] = rim.kappa_start = kappa
         rim.evaluate()
         rim.step(rim.active(curvature=False))
         for _ in range(4):
-            rim.step(rim.active("u", "v", "radius", "sigma", "kappa", curvature=False))
-        cost = float((rim.weight * rim.residual**2).sum())
-        if best is None or cost < best[0]:
-            best = (cost, rim.shape, rim.nodes, rim.white, kappa)
+            rim.step(rim.active("u", "v", "radius", "sigma", curvature=False), careful=True)
+        if best is None or rim.cost < best[0]:
+            best = (rim.cost, rim.shape, rim.nodes, rim.white, kappa)
     assert best is not None
     _, rim.shape, rim.nodes, rim.white, rim.kappa_start = best
     rim.evaluate()
@@ -311,7 +349,6 @@ def _weigh(rim: _Rim, floor: float, parameters: float) -> tuple[float, float, Ar
     """
     s, sigma, k = rim.rim[:, 0], rim.shape[3], rim.n_nodes
     square = rim.residual**2
-    x = np.clip((rim.model - rim.white) / (rim.level - rim.white), 0.0, 1.3)
     outside, inside = s > 3 * sigma, s < -3 * sigma
     limit = OUTLIER**2 * (_sector_median(square[outside], rim.left[outside], k)[rim.left] / 0.455 + floor)
     rim_zone = ~(outside | inside)
@@ -325,13 +362,13 @@ def _weigh(rim: _Rim, floor: float, parameters: float) -> tuple[float, float, Ar
     mean = np.bincount(rim.left, weights=square * (used & outside), minlength=k) / np.maximum(n_k - parameters, 1)
     v_out = max(float(np.median(mean[enough])), floor)
     core = inside & used if (inside & used).sum() > 20 else used & (s < 0)
-    v_in, x_in = (float(square[core].mean()), float(x[core].mean())) if core.any() else (v_out, 1.0)
-    slope = (v_out - v_in) / max(1.0 - x_in, 0.05)
-    v_low, v_high = max(v_out - slope, 1e-4 * v_out, floor), v_out
-    expected = np.maximum(v_low + (v_high - v_low) * x, floor)
+    v_in, level_in = (float(square[core].mean()), float(rim.model[core].mean())) if core.any() else (v_out, rim.white)
+    v_in = max(v_in, floor)
+    x = np.clip((rim.model - level_in) / (rim.level - level_in), 0.0, 1.3)
+    expected = np.maximum(v_in + (v_out - v_in) * x, min(v_in, v_out))
     chi2 = np.bincount(rim.left, weights=square * (used & outside) / expected, minlength=k) / np.maximum(n_k, 1)
     rim.weight = np.where(used, 1.0 / expected, 0.0)
-    return v_low, v_high, (chi2 - 1.0) / np.sqrt(2.0 / np.maximum(n_k, 1))
+    return v_in, v_out, (chi2 - 1.0) / np.sqrt(2.0 / np.maximum(n_k, 1))
 
 
 def _sector_median(values: Array, sector: Array, k: int) -> Array:
@@ -357,7 +394,7 @@ def _curvature_precision(rim: _Rim, active: npt.NDArray[np.intp]) -> Array:
     V = solve(N, unit)[at, np.arange(at.size)]
     excess = rim.nodes[:, 2] ** 2 - V
     smooth = (np.roll(excess, 1) + 2 * excess + np.roll(excess, -1)) / 4
-    return np.asarray(1.0 / np.maximum(smooth, 1e-3 * V))
+    return np.where(V > 0, 1.0 / np.maximum(np.maximum(smooth, 1e-3 * V), 1e-300), 0.0)
 
 
 def _anisotropy(rim: _Rim, shape: tuple[str, ...]) -> tuple[Array, Array]:
@@ -401,6 +438,8 @@ def _result(
     chi2_near = float((normalised[near] ** 2).mean()) if near.any() else 1.0
     if chi2_near > 1.0 + 5.0 * math.sqrt(2.0 / n_near):
         block = block * chi2_near
+    all_near = (np.abs(s) <= 3 * sigma) & (rim.weight > 0)
+    rim_rms = math.sqrt(float((rim.residual[all_near] ** 2).mean())) if all_near.any() else 0.0
     covariance = np.full((N_SHAPE, N_SHAPE), np.nan)
     covariance[np.ix_(at, at)] = block
     weighted = rim.weight > 0
@@ -417,6 +456,7 @@ def _result(
         rho=rho,
         visible=visible,
         lost=lost,
+        rim_rms=rim_rms,
         misfit=float((excess >= MISFIT).mean()),
         anisotropy=anisotropy,
         anisotropy_covariance=anisotropy_covariance,

@@ -3,8 +3,8 @@ r"""The radiograph around the rim and its normal equations.
     I = sum_k hat_k(psi) (a_k O(s) + b_k R(s) + c_k Q(s)) + w (1 - O(s))
 
 a_k, b_k, c_k are the background's level, slope and curvature at angular node k, w what the ball puts in its place
-(scattered radiation, the detector's offset; white in an inverted image).  Every pixel sees two nodes, so that its row of the
-Jacobian has 14 entries whatever the number of nodes.
+(scattered radiation, the detector's offset; white in an inverted image).  Every pixel sees two nodes, so that its row
+of the Jacobian has 14 entries whatever the number of nodes.
 """
 
 from __future__ import annotations

@@ -25,7 +25,10 @@ FAINT = 0.4
 """A candidate with less than this share of the best one's contrast is no rival."""
 EQUAL = 0.75
 """A second candidate with this share of the best one's merit makes the image ambiguous."""
-PRIOR = 0.5
+ROUND, FINE_ROUND = 0.08, 0.03
+"""Deviation from a circle, in radii, that a ray may show on a coarse level and on the fine one: a hexagon shows 0.07."""
+FINALISTS = 4
+PRIOR = 0.25
 """Width of the preference for the nominal radius, in log radius: loose, for magnification varies with the pose."""
 
 
@@ -79,6 +82,9 @@ def find_ball(
         raise BallNotFoundError(
             "no circle with a complete rim of one polarity; is the ball in view, and its contrast above noise?"
         )
+    candidates = _finalists(image, candidates, aspect, expected_radius)
+    if not candidates:
+        raise BallNotFoundError("nothing in the image is round enough to be a ball")
     best = candidates[0]
     if near is not None:
         likely = [c for c in candidates if c.merit > EQUAL * best.merit and c.contrast > FAINT * best.contrast]
@@ -96,11 +102,17 @@ def find_ball(
                 f"two shapes could be the ball: at ({best.u:.0f}, {best.v:.0f}), radius {best.radius:.0f} px, and at "
                 f"({other.u:.0f}, {other.v:.0f}), radius {other.radius:.0f} px; give a predicted position or crop"
             )
-    return _refined(image, best, aspect), tuple(candidates)
+    return best, tuple(candidates)
 
 
-def _refined(image: Array, c: Candidate, aspect: float) -> Candidate:
-    """The candidate again on a finer image of its surroundings, so that the fit starts within a pixel."""
+def _finalists(image: Array, candidates: list[Candidate], aspect: float, expected_radius: float) -> list[Candidate]:
+    """The best few candidates, looked at again on finer images."""
+    again = [_refined(image, c, aspect) for c in candidates[:FINALISTS]]
+    return _distinct([c for c in again if c is not None], expected_radius)
+
+
+def _refined(image: Array, c: Candidate, aspect: float) -> Candidate | None:
+    """The candidate again on a finer image of its surroundings, so that the fit starts within a pixel; None if it is not round."""
     factor = max(1, int(c.radius / 40))
     reach = 1.5 * c.radius + 8
     u, v = max(int(c.u - reach), 0), max(int(c.v - reach / aspect), 0)
@@ -110,10 +122,10 @@ def _refined(image: Array, c: Candidate, aspect: float) -> Candidate:
     radius = c.radius / factor
     half = max(2.0, 0.15 * radius)
     yes, x, y, radius, complete, visible, contrast = check_circle(
-        level, (c.u - u - shift) / factor, (c.v - v - shift) / factor, radius - half, radius + half, sign, aspect, 0.0
+        level, (c.u - u - shift) / factor, (c.v - v - shift) / factor, radius - half, radius + half, sign, aspect, 0.0, FINE_ROUND
     )
-    if not yes or complete < 0.8 * c.complete:
-        return c
+    if not yes or complete < COMPLETE:
+        return None
     return Candidate(u=x * factor + shift + u, v=y * factor + shift + v, radius=radius * factor, complete=complete,
                      visible=visible, contrast=contrast, bright=c.bright, merit=c.merit)  # fmt: skip
 
@@ -137,7 +149,7 @@ def _on_level(image: Array, factor: int, aspect: float) -> list[Candidate]:
     for u, v, low, high, polarity in centres:
         sign = -1.0 if polarity == 1 else 1.0
         yes, x, y, radius, complete, visible, contrast = check_circle(
-            level, u, v, 0.75 * low, 1.3 * high, sign, aspect, noise
+            level, u, v, 0.75 * low, 1.3 * high, sign, aspect, noise, ROUND
         )
         if yes and complete >= COMPLETE and contrast > 0:
             shift = (factor - 1) / 2
@@ -168,10 +180,11 @@ def _distinct(candidates: list[Candidate], expected_radius: float) -> list[Candi
 
 
 @njit(cache=True)
-def check_circle(image, u, v, low, high, sign, aspect, noise):  # type: ignore[no-untyped-def]
+def check_circle(image, u, v, low, high, sign, aspect, noise, tightness):  # type: ignore[no-untyped-def]
     """(found, u, v, radius, complete, visible, contrast) of the circle near (u, v) with radius in [low, high].
 
     sign: +1 for a ball darker than its surroundings, -1 for a brighter one.  noise: standard deviation of a pixel.
+    tightness: deviation from the circle, in radii, up to which a ray agrees.
     """
     nothing = (False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     turns = 5
@@ -193,7 +206,7 @@ def check_circle(image, u, v, low, high, sign, aspect, noise):  # type: ignore[n
         cx, cy, radius = _robust_circle(x, y, good, np.median(edge[good]))
         if not (0.5 * low < radius < 2.0 * high) or math.hypot(cx, cy) > 0.8 * high:
             return nothing
-        tolerance = max(0.08 * radius, 0.6)
+        tolerance = max(tightness * radius, 0.6)
         agree = 0
         for k in range(RAYS):
             deviation[k] = abs(math.hypot(x[k] - cx, y[k] - cy) - radius)
