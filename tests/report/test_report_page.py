@@ -134,6 +134,17 @@ def test_parameters_without_uncertainty_are_not_determinable(sample):
     assert not re.search(r"\b(nan|inf)\b", shown, re.I)
 
 
+def test_a_calibration_without_residuals_is_reported_as_such(sample):
+    calibration, observations, poses = sample(verdict="rejected")
+    empty = dataclasses.replace(
+        calibration, pose_id=(), x_D=np.empty((0, 2)), residuals=np.empty((0, 2)), converged=False, dof=0
+    )
+    html = calibration_report(empty, observations=observations, poses=poses)
+    assert "it ended before poses were fitted" in html
+    assert "Not converged." in html
+    assert figures_of(html) == {}
+
+
 def test_names_cannot_break_out_of_the_page(sample):
     calibration, observations, poses = sample()
     evil = "</script><script>alert(1)</script>"

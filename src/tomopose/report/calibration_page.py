@@ -41,6 +41,7 @@ from tomopose.report.words import (
     meaning,
     number,
     small_unit,
+    with_unit,
 )
 from tomopose.units import value_with_uncertainty
 
@@ -82,15 +83,10 @@ def calibration_report(
     -------
     HTML text; it loads nothing from a network.  Parts that were not given are named as such.
     """
-    joined = join(calibration, observations=observations, poses=poses)
     n, left = len(calibration.pose_id), len(calibration.outliers)
     sections = [
         _parameters(calibration),
-        _residuals(calibration, joined),
-        _detections(calibration, joined, observations, thumbnails),
-        _observability(calibration),
-        _coverage(calibration, joined, observations),
-        _scene(calibration, joined, scan),
+        *_data_sections(calibration, observations=observations, poses=poses, thumbnails=thumbnails, scan=scan),
         *(section for section in (checks_section(calibration), history_section(history)) if section is not None),
         provenance_section(calibration.provenance),
     ]
@@ -107,6 +103,24 @@ def calibration_report(
     return render(page)
 
 
+def _data_sections(
+    calibration: Calibration, *, observations: BallObservations | None, poses: PoseSequence | None,
+    thumbnails: Sequence[Thumbnail], scan: ProjectionMatrices | None,
+) -> list[Section]:
+    """What rests on residuals; a calibration that failed before it had any says so."""
+    if not calibration.pose_id:
+        words = "The calibration holds no residuals: it ended before poses were fitted."
+        return [Section(title="How well the data fit", blocks=[Words(paragraphs=[words])])]
+    joined = join(calibration, observations=observations, poses=poses)
+    return [
+        _residuals(calibration, joined),
+        _detections(calibration, joined, observations, thumbnails),
+        _observability(calibration),
+        _coverage(calibration, joined, observations),
+        _scene(calibration, joined, scan),
+    ]
+
+
 def _verdict(calibration: Calibration) -> Verdict:
     sentence = calibration.status or "The solver gave no sentence about how it ended."
     if not calibration.converged:
@@ -121,9 +135,10 @@ def _verdict(calibration: Calibration) -> Verdict:
 
 def _key_figures(calibration: Calibration, scan: ProjectionMatrices | None) -> list[KeyFigure]:
     chi2 = calibration.chi2_dof
+    d_px, d_um = (calibration.d_rms, calibration.d_rms_um) if calibration.pose_id else (np.nan, np.nan)
     keys = [
-        KeyFigure(name="Reprojection error d_rms", value=f"{number(calibration.d_rms)} px", note="eq. (8)"),
-        KeyFigure(name="… at the object", value=f"{number(calibration.d_rms_um)} µm", note="pitch over magnification"),
+        KeyFigure(name="Reprojection error d_rms", value=with_unit(d_px, "px"), note="eq. (8)"),
+        KeyFigure(name="… at the object", value=with_unit(d_um, "µm"), note="pitch over magnification"),
         KeyFigure(
             name="χ² per degree of freedom",
             value=number(chi2) if np.isfinite(chi2) else NOT_DETERMINABLE,

@@ -87,6 +87,11 @@ def number(value: Any) -> str:
     return f"{x:.{min(max(2 - exponent, 0), 8)}f}" if -5 <= exponent < 6 else f"{x:.3g}"
 
 
+def with_unit(value: Any, unit: str) -> str:
+    """A number with three figures and its unit; no unit where there is no number."""
+    return f"{number(value)} {unit}" if math.isfinite(float(value)) else NOT_DETERMINABLE
+
+
 def decimals(values: Any, *, fewest: int = 4) -> int:
     """Digits after the point that show two figures of the rms of values, never fewer than `fewest`."""
     x = np.asarray(values, dtype=np.float64)
