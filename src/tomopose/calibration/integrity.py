@@ -29,16 +29,24 @@ SIGNIFICANT = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """Something that moved.  size_px: rms change of the centres by it;  p: probability by chance;  words."""
+    """Something that moved.
+
+    p: probability by chance, if the residuals are white;  size_px: rms change of the centres by it;
+    share: of chi2 that it explains;  words;  at: pose_id of a sudden change.
+    """
 
     name: str
     p: float
     size_px: float
+    share: float
     words: str
     at: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        return {"name": self.name, "p": self.p, "size_px": self.size_px, "words": self.words, "at": self.at}
+        return {
+            "name": self.name, "p": self.p, "size_px": self.size_px, "share": self.share, "words": self.words,
+            "at": self.at,
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,21 +84,30 @@ def elapsed(problem: Problem) -> Array:
     return np.arange(len(problem), dtype=np.float64)
 
 
-def drift(problem: Problem, Jw: Array, rw: Array, columns: Array, scale: float) -> Effect:
-    """A slow move of the ball's place in T, linear in time.  columns (n, 2, 3): whitened derivatives by t_HT."""
+def drift(problem: Problem, Jw: Array, rw: Array, columns: Array, scale: float, *, name: str, words: str,
+          unit: tuple[float, str]) -> Effect:
+    """A slow change, linear in time, of the coordinates behind `columns` (n, 2, c), whitened derivatives.
+
+    words: with {} for the change over the whole run, given in unit (factor, name).
+    """
+    c = columns.shape[2]
     tau = elapsed(problem)
     tau = (tau - tau.mean()) / np.ptp(tau)
-    C = (columns * tau[:, None, None]).reshape(-1, 3)
+    C = (columns * tau[:, None, None]).reshape(-1, c)
     Q, _ = np.linalg.qr(Jw.reshape(-1, Jw.shape[2]))
     C_free = C - Q @ (Q.T @ C)
     move, *_ = np.linalg.lstsq(C_free, rw.ravel(), rcond=1e-8)
     gain = float((C_free @ move) @ rw.ravel()) / scale
     size = _size_px(problem, (C @ move).reshape(-1, 2))
-    um = float(np.linalg.norm(move)) * 1000
+    factor, symbol = unit
     return Effect(
-        name="drift", p=float(chdtrc(3, max(gain, 0.0))), size_px=size,
-        words=f"the ball drifts by {um:.2g} um over the run, {size:.2g} px rms",
+        name=name, p=float(chdtrc(c, max(gain, 0.0))), size_px=size, share=_share(gain * scale, rw),
+        words=f"{words.format(f'{float(np.linalg.norm(move)) * factor:.2g} {symbol}')} over the run, {size:.2g} px rms",
     )
+
+
+def _share(explained: float, rw: Array) -> float:
+    return explained / max(float((rw**2).sum()), 1e-300)
 
 
 def _size_px(problem: Problem, whitened: Array) -> float:
@@ -129,6 +146,7 @@ def change_point(problem: Problem, Jw: Array, rw: Array, columns: Array, scale: 
     size = _size_px(problem, late @ step)
     return Effect(
         name=name, p=float(min(1.0, chdtrc(c, float(gain.max())) * len(places))), size_px=size,
+        share=_share(float(gain.max()) * scale, rw),
         words=f"{words} at pose {problem.pose_id[k]}: {size:.2g} px rms", at=problem.pose_id[k],
     )
 
@@ -185,7 +203,10 @@ def integrity(problem: Problem, free: FreeParameters, fit: Fit) -> Integrity:
     Jw, rw = problem.W @ J, (problem.W @ r[:, :, None])[..., 0]
     scale = max(1.0, float((rw**2).sum()) / max(2 * len(problem) - J.shape[2], 1))
     found = [
-        drift(problem, Jw, rw, problem.W @ b.J_t_HT, scale),
+        drift(problem, Jw, rw, problem.W @ b.J_t_HT, scale, name="drift", words="the ball drifts by {}",
+              unit=(1000.0, "um")),
+        drift(problem, Jw, rw, problem.W, scale, name="image drift",
+              words="the images drift by {} (focal spot or detector)", unit=(1.0, "px")),
         change_point(problem, Jw, rw, problem.W @ b.J_t, scale, name="ball", words="the ball changed its place"),
         change_point(problem, Jw, rw, problem.W @ b.J_mount, scale, name="mount",
                      words="the mount changed (bumped or referenced anew)"),

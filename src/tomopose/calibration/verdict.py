@@ -13,6 +13,9 @@
 | held-out poses predicted 3 times worse than fitted ones, and worse than their own prediction by 2 sigma | doubtful |
 | a tilt of 5 degrees would carry more than 0.25 px of standard uncertainty at the field's edge | doubtful |
 
+Where chi2/dof is above 4, a drift or change point must also explain a quarter of chi2: residuals that come from the
+poses are not white, and their chance patterns look significant.
+
 What the poses cannot tell about *assumed* scanner parameters or conventions is noted, and is no ground for doubt in the
 fit: the verdict judges the data against what was declared.
 """
@@ -31,6 +34,7 @@ OUTLIER_SHARE, FEW_DOF = 0.1, 10
 MISFIT_CHI2, MISFIT_PX = 4.0, 0.05
 EFFECT_PX, REPEAT_SIGMAS, REPEAT_PX = 0.02, 5.0, 0.05
 HELD_OUT_FACTOR, HELD_OUT_CHI2 = 3.0, 4.0
+EFFECT_SHARE = 0.25
 SCAN_PX = 0.25
 
 
@@ -82,9 +86,14 @@ def verdict(f: Findings) -> tuple[str, tuple[str, ...]]:
             "identify the manipulator's errors (--manipulator)"
         )
     if f.integrity:
-        moved = [e for e in f.integrity.effects if e.p < SIGNIFICANT and e.size_px > EFFECT_PX]
-        steps = sorted((e for e in moved if e.at), key=lambda e: e.p)[:1]
-        doubtful += [f"{e.words} (p = {e.p:.1g})" for e in moved if not e.at or e in steps]
+        # residuals that come from the poses are not white: there, chance alone explains what looks significant
+        least = EFFECT_SHARE if f.chi2_dof > MISFIT_CHI2 else 0.0
+        moved = [
+            e for e in f.integrity.effects if e.p < SIGNIFICANT and e.size_px > EFFECT_PX and e.share > least
+        ]
+        # drifts resemble one another, and so do steps: the likeliest of each is named
+        for kind in ([e for e in moved if not e.at], [e for e in moved if e.at]):
+            doubtful += [f"{e.words} (p = {e.p:.1g})" for e in sorted(kind, key=lambda e: (e.p, -e.share))[:1]]
         doubtful += [
             f"pose {r['first']} taken again as {r['again']} is off by {r['distance_px']:.3g} px "
             f"({r['sigmas']:.1f} sigma)"
