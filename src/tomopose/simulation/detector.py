@@ -16,7 +16,7 @@ import numpy as np
 from scipy import ndimage
 
 from tomopose.errors import InputError
-from tomopose.geometry.scanner import Scanner
+from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 from tomopose.simulation.effects import MTF, Glare, Scatter
 from tomopose.simulation.noise import add_normal_noise, add_photon_noise, digitise, frame_key
 from tomopose.simulation.projector import in_bands
@@ -167,9 +167,15 @@ def _raw(signal: Array, detector: Detector, *, seed: int, frame: int, stream: in
     return np.asarray(raw)
 
 
-@functools.lru_cache(maxsize=2)
 def reference_images(detector: Detector, scanner: Scanner, seed: int) -> tuple[Any, Any]:
     """(dark, flat), grey values: means of `flats` images, with what noise the averaging leaves."""
+    names = [*PARAMETER_UNITS, "n_u", "n_v"]
+    return _reference_images(detector, tuple((name, getattr(scanner, name)) for name in names), seed)
+
+
+@functools.lru_cache(maxsize=2)
+def _reference_images(detector: Detector, panel: tuple[tuple[str, Any], ...], seed: int) -> tuple[Any, Any]:
+    scanner = Scanner(**dict(panel))
     profile = beam_profile(scanner, detector)
     empty = np.ones(scanner.shape) if profile is None else profile
     gain, dark, dead = fixed_pattern(detector, scanner.shape, seed)
