@@ -39,20 +39,20 @@ def read_manipulator(path: str | Path) -> Hexapod | SerialRobot:
     Raises FileError or SchemaVersionError where it is no such file; ShapeError, UnitError or InputError where a joint
     is missing, a unit or key is unknown, or numbers belong to another unit.
     """
-    try:
-        document = read_json(path, "hexapod")
-    except SchemaVersionError as error:
+    found = {}
+    for name, make in (("hexapod", hexapod_from_document), ("serial", serial_from_document)):
         try:
-            document = read_json(path, "serial")
-        except SchemaVersionError:
-            if "newer" in str(error):
-                raise
-            raise SchemaVersionError(
-                f'{path} describes no manipulator: "schema" must be "tomopose/hexapod/1" or "tomopose/serial/1"',
-                path=path,
-            ) from error
-        return serial_from_document(document, str(path))
-    return hexapod_from_document(document, str(path))
+            return make(read_json(path, name), str(path))
+        except SchemaVersionError as error:
+            found[name] = error
+        except InputError as error:
+            raise error if str(path) in str(error) else type(error)(f"{path}: {error}") from error
+    newer = [error for error in found.values() if "newer" in str(error)]
+    if newer:
+        raise newer[0]
+    raise SchemaVersionError(
+        f'{path} describes no manipulator: "schema" must be "tomopose/hexapod/1" or "tomopose/serial/1"', path=path
+    )
 
 
 def write_manipulator(
