@@ -56,8 +56,8 @@ def require_usable(matrices: ProjectionMatrices, grid: VoxelGrid) -> None:
         raise OutOfViewError(
             f"the volume lies outside the field of view in {missed.size} of {len(matrices)} views (first: view "
             f"{first}, where it would fall on u {u[first].min():.0f} to {u[first].max():.0f}, v {v[first].min():.0f} "
-            f"to {v[first].max():.0f} of {matrices.n_u} x {matrices.n_v} pixels); move or enlarge the grid, or check the "
-            "matrices",
+            f"to {v[first].max():.0f} of {matrices.n_u} x {matrices.n_v} pixels); move or enlarge the grid, or check "
+            "the matrices",
             indices=missed.tolist(),
         )
 

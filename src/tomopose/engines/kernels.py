@@ -9,6 +9,8 @@ pixel is the bilinear look-up divided by the weights that lie on the detector, t
 has no say.  Forward projection follows Joseph (IEEE Trans. Med. Imaging 1 (1982) 192): planes across the ray's steepest
 axis, bilinear within each.  Both work for rays of any direction.  Geometry is float64 down to one block of voxels or
 rays, data float32.
+
+numba's cache looks at this file only: whoever changes vector.py saves this one as well.
 """
 
 from __future__ import annotations
@@ -48,6 +50,14 @@ def seen_layers(P: Any, x: int, y: int, n_z: int, n_u: int, n_v: int) -> tuple[i
     a_u, b_u = P[0, 0] * x + P[0, 1] * y + P[0, 3], P[0, 2]
     a_v, b_v = P[1, 0] * x + P[1, 1] * y + P[1, 3], P[1, 2]
     a_w, b_w = P[2, 0] * x + P[2, 1] * y + P[2, 3], P[2, 2]
+    # Most columns are seen whole: where both ends are, so is all between, and no division is needed.
+    top = n_z - 1
+    u, v, w = a_u + b_u * top, a_v + b_v * top, a_w + b_w * top
+    if (
+        a_u + a_w > 0.0 and u + w > 0.0 and n_u * a_w > a_u and n_u * w > u
+        and a_v + a_w > 0.0 and v + w > 0.0 and n_v * a_w > a_v and n_v * w > v
+    ):
+        return 0, n_z
     low, high = _clip_range(-1.0, float(n_z), a_u + a_w, b_u + b_w)
     low, high = _clip_range(low, high, n_u * a_w - a_u, n_u * b_w - b_u)
     low, high = _clip_range(low, high, a_v + a_w, b_v + b_w)
@@ -67,7 +77,9 @@ def _back_column_vector(
     middle = 0.5 * (z_0 + z_1 - 1)
     w = a_w + P[2, 2] * middle
     # Counting from a pixel near the column's middle keeps the float32 quotients of a block small, hence exact.
-    u_ref, v_ref = math.floor((a_u + P[0, 2] * middle) / w), math.floor((a_v + P[1, 2] * middle) / w)
+    reciprocal = 1.0 / w
+    u_ref = math.floor((a_u + P[0, 2] * middle) * reciprocal)
+    v_ref = math.floor((a_v + P[1, 2] * middle) * reciprocal)
     a_u -= u_ref * a_w
     a_v -= v_ref * a_w
     b_u, b_v = P[0, 2] - u_ref * P[2, 2], P[1, 2] - v_ref * P[2, 2]
@@ -236,18 +248,19 @@ def forward_columns(
     rays = np.zeros(4 * W, dtype=np.float32)
     sums = np.zeros(W, dtype=np.float32)
     steps = np.zeros(W)
-    d = np.zeros(3)
+    d, e = np.zeros(3), np.zeros(3)
     for u in range(u_0, u_1):
         v = 0
         while v < n_v:
             count = min(W, n_v - v)
-            axis = -1
-            for lane in range(count):
-                for i in range(3):
-                    d[i] = M_inv[i, 0] * u + M_inv[i, 1] * (v + lane) + M_inv[i, 2]
-                own = steepest_axis(d[0], d[1], d[2])
-                axis = own if axis in (-1, own) else 3
-            together = vector and axis < 2
+            # Directions change linearly with v: what is steepest, with one sign, at both ends is so in between.
+            for i in range(3):
+                d[i] = M_inv[i, 0] * u + M_inv[i, 1] * v + M_inv[i, 2]
+                e[i] = d[i] + M_inv[i, 1] * (count - 1)
+            axis = steepest_axis(d[0], d[1], d[2])
+            together = (
+                vector and axis < 2 and axis == steepest_axis(e[0], e[1], e[2]) and (d[axis] > 0.0) == (e[axis] > 0.0)
+            )
             k_0, k_1 = shape[0] + shape[1] + shape[2], 0
             for lane in range(count):
                 for i in range(3):
@@ -271,6 +284,9 @@ def forward_columns(
                         )
                     image[u, v + lane] = total * steps[lane]
             if together:
+                for lane in range(count, W):  # the block's unused lanes follow its last ray
+                    for i in range(4):
+                        rays[i * W + lane] = rays[i * W + count - 1]
                 sums[:] = 0.0
                 if k_1 > k_0:
                     other = 1 - axis

@@ -1,9 +1,10 @@
 """LLVM vector building blocks of the CPU kernels: W voxels of a column, or W rays of adjacent detector rows, at a time.
 
 Numba's own vectoriser turns neither the bilinear look-up of back-projection nor Joseph's into vector code, because the
-loads are gathers and the stores may alias.  The blocks below say it to LLVM directly.  A bilinear look-up needs two
-loads a lane: the pair of neighbours along the fastest axis comes as one 64 bit word.  LLVM maps the vectors to whatever
-the processor has; W is 16 with AVX-512 and 8 elsewhere.  The same results come from the plain kernels in kernels.py.
+loads are gathers and the stores may alias.  The blocks below say it to LLVM directly.  A bilinear look-up takes two
+loads a lane, the pair of neighbours along the fastest axis as one 64 bit word; with AVX-512 most blocks take four whole
+rows and a permutation instead.  LLVM maps the vectors to whatever the processor has; W is 16 with AVX-512 and 8
+elsewhere.  The same results come from the plain kernels in kernels.py.
 """
 
 from __future__ import annotations
@@ -53,6 +54,10 @@ def _data(context: Any, builder: Any, array_type: Any, array: Any) -> Any:
     return cgutils.create_struct_proxy(array_type)(context, builder, array).data
 
 
+def _count(context: Any, builder: Any, array_type: Any, array: Any) -> Any:
+    return cgutils.create_struct_proxy(array_type)(context, builder, array).nitems
+
+
 def _at(builder: Any, data: Any, index: Any, kind: Any) -> Any:
     return builder.bitcast(builder.gep(data, [index], source_etype=F32), kind.as_pointer())
 
@@ -78,15 +83,89 @@ def _pairs(builder: Any, data: Any, base: Any, offset: Any) -> tuple[Any, Any]:
     return builder.shuffle_vector(both, undefined, even), builder.shuffle_vector(both, undefined, odd)
 
 
-def _bilinear(builder: Any, data: Any, base: Any, row: Any, a: Any, b: Any) -> Any:
+def _all(builder: Any, mask: Any) -> Any:
+    """Whether every lane of a mask is set."""
+    bits = ir.IntType(W)
+    return builder.icmp_unsigned("==", builder.bitcast(mask, bits), ir.Constant(bits, -1))
+
+
+def _pick(builder: Any, low: Any, high: Any, index: Any) -> Any:
+    """Lanes of two vectors side by side, by index 0 .. 31 (AVX-512's vpermi2ps)."""
+    kind = ir.FunctionType(VF, [VF, VI, VF])
+    function = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512.vpermi2var.ps.512")
+    return builder.call(function, [low, index, high])
+
+
+def _near(builder: Any, data: Any, start: Any, row: Any, d_a: Any, d_b: Any, rows: int) -> tuple[Any, ...]:
+    """The four neighbours of lanes that lie within `rows` - 1 rows and 31 columns: whole rows loaded, lanes picked."""
+    step = builder.sext(row, I64)
+    one, width = ir.Constant(VI, [1] * W), ir.Constant(I64, W)
+    picked = []
+    for _ in range(rows):
+        low, high = _load(builder, data, start), _load(builder, data, builder.add(start, width))
+        picked.append((_pick(builder, low, high, d_b), _pick(builder, low, high, builder.add(d_b, one))))
+        start = builder.add(start, step)
+    if rows == 2:
+        return (*picked[0], *picked[1])
+    upper = builder.icmp_unsigned("==", d_a, one)
+    return tuple(
+        builder.select(upper, picked[r + 1][side], picked[r][side]) for r in (0, 1) for side in (0, 1)
+    )
+
+
+def _neighbours(builder: Any, data: Any, count: Any, base: Any, row: Any, i_a: Any, i_b: Any) -> tuple[Any, ...]:
+    """data at (i_a, i_b), (i_a, i_b + 1), (i_a + 1, i_b), (i_a + 1, i_b + 1), lane by lane.
+
+    Adjacent lanes mostly want adjacent elements.  With AVX-512, lanes that share a row (or two) and 31 columns are
+    picked out of whole rows; other lanes are loaded pair by pair.  No row is read beyond `count` elements.
+    """
+
+    def one_by_one() -> tuple[Any, ...]:
+        offset = builder.add(builder.mul(i_a, _splat(builder, row)), i_b)
+        return (
+            *_pairs(builder, data, base, offset),
+            *_pairs(builder, data, builder.add(base, builder.sext(row, I64)), offset),
+        )
+
+    if W != 16:
+        return one_by_one()
+    found = [cgutils.alloca_once(builder, VF) for _ in range(4)]
+
+    def keep(values: tuple[Any, ...]) -> None:
+        for place, value in zip(found, values, strict=True):
+            builder.store(value, place)
+
+    def smaller_end(index: Any) -> Any:
+        first, last = (builder.extract_element(index, ir.Constant(I32, lane)) for lane in (0, W - 1))
+        return builder.select(builder.icmp_signed("<", first, last), first, last)
+
+    a_0, b_0 = smaller_end(i_a), smaller_end(i_b)
+    d_a, d_b = builder.sub(i_a, _splat(builder, a_0)), builder.sub(i_b, _splat(builder, b_0))
+    step = builder.sext(row, I64)
+    start = builder.add(base, builder.add(builder.mul(builder.sext(a_0, I64), step), builder.sext(b_0, I64)))
+    end = builder.add(start, builder.add(builder.mul(step, ir.Constant(I64, 2)), ir.Constant(I64, 2 * W)))
+    columns = _all(builder, builder.icmp_unsigned("<=", d_b, ir.Constant(VI, [2 * W - 2] * W)))
+    columns = builder.and_(columns, builder.icmp_signed("<=", end, count))
+    one_row = _all(builder, builder.icmp_unsigned("==", d_a, ir.Constant(VI, [0] * W)))
+    two_rows = _all(builder, builder.icmp_unsigned("<=", d_a, ir.Constant(VI, [1] * W)))
+    with builder.if_else(builder.and_(columns, one_row)) as (then, otherwise):
+        with then:
+            keep(_near(builder, data, start, row, d_a, d_b, 2))
+        with otherwise, builder.if_else(builder.and_(columns, two_rows)) as (also, rest):
+            with also:
+                keep(_near(builder, data, start, row, d_a, d_b, 3))
+            with rest:
+                keep(one_by_one())
+    return tuple(builder.load(place, typ=VF) for place in found)
+
+
+def _bilinear(builder: Any, data: Any, count: Any, base: Any, row: Any, a: Any, b: Any) -> Any:
     """data at the fractional position (a, b): a counts rows of length `row` (int32), b is the contiguous axis."""
     floor_a, floor_b = _call(builder, "floor", a), _call(builder, "floor", b)
     f_a, f_b = builder.fsub(a, floor_a), builder.fsub(b, floor_b)
-    offset = builder.add(
-        builder.mul(builder.fptosi(floor_a, VI), _splat(builder, row)), builder.fptosi(floor_b, VI)
+    p00, p01, p10, p11 = _neighbours(
+        builder, data, count, base, row, builder.fptosi(floor_a, VI), builder.fptosi(floor_b, VI)
     )
-    p00, p01 = _pairs(builder, data, base, offset)
-    p10, p11 = _pairs(builder, data, builder.add(base, builder.sext(row, I64)), offset)
     low = _call(builder, "fma", f_b, builder.fsub(p01, p00), p00)
     high = _call(builder, "fma", f_b, builder.fsub(p11, p10), p10)
     return _call(builder, "fma", f_a, builder.fsub(high, low), low)
@@ -120,7 +199,7 @@ def _back_block(inverse_square: bool) -> Any:
 
             reciprocal = builder.fdiv(ir.Constant(VF, [1.0] * W), along(w, dw))
             value = _bilinear(
-                builder, pixels, base, row,
+                builder, pixels, _count(context, builder, signature.args[2], image), base, row,
                 builder.fmul(along(u, du), reciprocal), builder.fmul(along(v, dv), reciprocal),
             )
             weight = _splat(builder, scale)
@@ -159,12 +238,13 @@ def forward_block(
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         volume, base, plane, row, rays, k_0, k_1, centre, a_end, b_end, sums, at = arguments
         voxels = _data(context, builder, signature.args[0], volume)
+        count = _count(context, builder, signature.args[0], volume)
         table = _data(context, builder, signature.args[4], rays)
         target = _data(context, builder, signature.args[10], sums)
         a, da, b, db = (_load(builder, table, ir.Constant(I64, i * W)) for i in range(4))
         a_end, b_end, low = _splat(builder, a_end), _splat(builder, b_end), ir.Constant(VF, [-1.0] * W)
         total = cgutils.alloca_once_value(builder, ir.Constant(VF, [0.0] * W))
-        with cgutils.for_range_slice(builder, k_0, k_1, ir.Constant(I64, 1), I64) as (k, _count):
+        with cgutils.for_range_slice(builder, k_0, k_1, ir.Constant(I64, 1), I64) as (k, _number):
             step = _splat(builder, builder.fsub(builder.sitofp(k, F32), centre))
 
             def held(position: Any, slope: Any, end: Any, step: Any = step) -> Any:
@@ -173,7 +253,7 @@ def forward_block(
                 return builder.select(builder.fcmp_ordered("<", place, end), place, end)
 
             start = builder.add(base, builder.mul(k, plane))
-            value = _bilinear(builder, voxels, start, row, held(a, da, a_end), held(b, db, b_end))
+            value = _bilinear(builder, voxels, count, start, row, held(a, da, a_end), held(b, db, b_end))
             builder.store(builder.fadd(builder.load(total, typ=VF), value), total)
         builder.store(builder.load(total, typ=VF), _at(builder, target, at, VF), align=4)
         return context.get_dummy_value()

@@ -1,0 +1,119 @@
+"""Slabs on disk, a cluster, and a killed process give the numbers of one piece in memory."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from reconstruction_phantom import balls, images_of, scan
+
+from tomopose.engines.storage import mapped
+from tomopose.errors import InputError
+from tomopose.reconstruction import reconstruct
+from tomopose.reconstruction.memory import GIB, memory_plan, padded_bytes
+from tomopose.volume import VoxelGrid
+
+GRID = VoxelGrid.cube(n=40, spacing=0.15)
+MATRICES = scan(GRID, n=36, n_u=61, n_v=57, field=1.3)
+IMAGES = images_of(MATRICES, balls(GRID, m=4, radius=(0.07, 0.12)), fine=2)
+
+
+def run(images=IMAGES, **settings):
+    return reconstruct(images, MATRICES, GRID, images_are="line-integrals", consistency="off", **settings)
+
+
+def rounding(a, b):
+    return float(np.abs(a - b).max() / np.ptp(b))
+
+
+@pytest.mark.parametrize("settings", [{}, {"subset_size": 4, "nonnegative": True}])
+def test_slabs_on_disk_are_the_whole(settings, tmp_path):
+    _z, y, x = np.meshgrid(*(np.arange(40),) * 3, indexing="ij")
+    mask = np.hypot(x - 19.5, y - 19.5) < 19.5 if settings else None
+    whole = run(mask=mask, **settings)
+    cut = run(mask=mask, **settings, slabs=3, scratch=tmp_path)
+    assert rounding(np.asarray(cut.values), whole.values) < 2e-5
+    assert np.abs(cut.view_residual - whole.view_residual).max() < 1e-6
+    assert np.array_equal(mapped(tmp_path / "volume.h5"), cut.values)
+
+
+def test_memory_decides_on_slabs(tmp_path):
+    big = VoxelGrid.cube(n=600, spacing=0.01)
+    plan = memory_plan(
+        MATRICES, big, subset_size=1, passes=2, memory_gib=0.7, most_voxels=2**31 - 1, may_cut=True
+    )
+    assert plan.in_one_piece > 0.7 * GIB
+    thickest = -(-600 // plan.slabs)
+    assert padded_bytes(big, thickest) + plan.images_bytes < 0.7 * GIB
+    assert plan.disk_bytes > 2 * 36 * 4 * 600**3
+    plan = memory_plan(
+        MATRICES, VoxelGrid.cube(n=2000, spacing=0.001), subset_size=10, passes=1, memory_gib=64.0,
+        most_voxels=2**31 - 1, may_cut=True,
+    )
+    assert plan.slabs > 1  # 32 GB fit, but not in one piece of 32 bit indices
+
+
+class Killed(Exception):
+    pass
+
+
+class Dying:
+    """Images that fail once a number of them has been read, as a killed process would."""
+
+    def __init__(self, after):
+        self.left = after
+
+    def __len__(self):
+        return len(IMAGES)
+
+    def __getitem__(self, j):
+        self.left -= 1
+        if self.left < 0:
+            raise Killed
+        return IMAGES[j]
+
+
+@pytest.mark.parametrize("where", ["memory", "disk"])
+@pytest.mark.parametrize("after", [20, 60, 85])  # in the FDK start, and in the first and second sweep of SART
+def test_a_killed_run_goes_on_to_the_same_numbers(where, after, tmp_path):
+    settings = {"iterations": 2, "checkpoint": tmp_path / "state", "checkpoint_seconds": 0.0, "subset_size": 3}
+    if where == "disk":
+        settings |= {"slabs": 2, "scratch": tmp_path / "slabs"}
+    expected = run(iterations=2, subset_size=3)
+    with pytest.raises(Killed):
+        run(Dying(after), **settings)
+    assert (tmp_path / "state" / "state.json").exists()
+    done = []
+    found = run(progress=lambda k, n: done.append((k, n)), **settings)
+    assert done[0][0] > 2  # it did not begin anew
+    assert done[-1][0] == done[-1][1]
+    if where == "memory":
+        assert np.array_equal(found.values, expected.values)
+    assert rounding(np.asarray(found.values), expected.values) < 2e-5
+    assert not (tmp_path / "state" / "state.json").exists()
+
+
+def test_another_reconstruction_does_not_take_the_checkpoint(tmp_path):
+    with pytest.raises(Killed):
+        run(Dying(45), checkpoint=tmp_path, checkpoint_seconds=0.0)
+    with pytest.raises(InputError, match="another reconstruction"):
+        run(checkpoint=tmp_path, relaxation=0.5)
+
+
+def test_progress_counts_all_updates():
+    seen = []
+    run(progress=lambda done, total: seen.append((done, total)), subset_size=5, iterations=2)
+    assert seen == [(k, 24) for k in range(1, 25)]  # 8 for the start by fives, 8 a sweep
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
+def test_a_cluster_is_the_whole():
+    distributed = pytest.importorskip("distributed")
+    whole = run(subset_size=6)
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None, memory_limit=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        cut = run(subset_size=6, client=client, engine_options={"threads": 1})
+    assert rounding(cut.values, whole.values) < 2e-5
