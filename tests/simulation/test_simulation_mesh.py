@@ -1,0 +1,135 @@
+"""Meshes: paths against the analytic ball, parity at shared edges, the specimen, and the image against the analytic one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tomopose import PoseSequence, RigidTransform, Scanner
+from tomopose.errors import EngineFailedError, FileError, InputError
+from tomopose.geometry.frames import Frame
+from tomopose.simulation.mesh import Mesh, MeshSolid, mesh_paths, read_mesh, write_stl
+from tomopose.simulation.rays import path_lengths
+from tomopose.simulation.run import simulate_ball_run, transmission
+from tomopose.simulation.shapes import Solid, box, cone, cylinder, half_space, sphere, torus
+from tomopose.simulation.specimen import LENGTH, measurands, specimen_mesh
+from tomopose.simulation.tessellate import tessellate
+
+pytest.importorskip("embreex")
+pytest.importorskip("manifold3d")
+
+CUBE = Mesh(
+    vertices=np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float),
+    faces=np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6],
+                    [0, 6, 4], [1, 5, 7], [1, 7, 3]]),
+)
+
+
+def ball(times):
+    """An octahedron's faces cut in four `times` times, all corners on the sphere of radius 2.5 mm."""
+    v = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float)
+    f = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    mesh = Mesh(vertices=v, faces=f)
+    for _ in range(times):
+        mesh = mesh.refined()
+        mesh = Mesh(vertices=mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True), faces=mesh.faces)
+    return Mesh(vertices=2.5 * mesh.vertices, faces=mesh.faces)
+
+
+def aimed(rng, n, reach):
+    o = np.array([283.5, 1.3, -2.1])
+    target = rng.uniform(-reach, reach, (n, 3))
+    target[:, 0] = 0
+    return o, target - o
+
+
+def test_a_ball_of_131k_triangles_against_the_analytic_one(rng):
+    mesh = ball(7)
+    assert len(mesh.faces) == 131072
+    o, d = aimed(rng, 100_000, 2.7)
+    error = mesh_paths(MeshSolid(mesh=mesh, material="Al"), o, d)
+    error -= path_lengths([Solid(shape=sphere(2.5), material="Al")], o, d)[:, 0]
+    assert error.std() < 1e-3
+    # Only rays that graze the rim can be far off, and by no more than the chord of the missing cap.
+    sagitta = 2.5 * (np.pi / 2 / 2**7) ** 2 / 2
+    assert np.abs(error).max() < 2 * np.sqrt(2 * 2.5 * 2 * sagitta)
+
+
+def test_rays_through_edges_and_corners_of_a_cube(rng):
+    o = np.array([50.0, 0.0, 0.0])
+    inside = np.array([[0, 0, 0], [0, 0.5, 0.5], [0, -0.25, 0.25], [0, 0.999, 0.0]])
+    L = mesh_paths(MeshSolid(mesh=CUBE, material="Al"), o, inside - o)
+    exact = path_lengths([Solid(shape=box(2, 2, 2), material="Al")], o, inside - o)[:, 0]
+    np.testing.assert_allclose(L, exact, atol=2e-4)
+    o, d = aimed(rng, 20_000, 1.2)
+    L = mesh_paths(MeshSolid(mesh=CUBE, material="Al"), o, d)
+    exact = path_lengths([Solid(shape=box(2, 2, 2), material="Al")], o, d)[:, 0]
+    np.testing.assert_allclose(L, exact, atol=2e-3)
+    assert np.abs(L - exact)[exact > 0.1].max() < 1e-6
+
+
+def test_open_and_inverted_meshes_are_refused():
+    with pytest.raises(InputError, match="not closed"):
+        MeshSolid(mesh=Mesh(vertices=CUBE.vertices, faces=CUBE.faces[:-1]), material="Al")
+    with pytest.raises(InputError, match="inwards"):
+        MeshSolid(mesh=Mesh(vertices=CUBE.vertices, faces=CUBE.faces[:, ::-1]), material="Al")
+    with pytest.raises(InputError):
+        Mesh(vertices=CUBE.vertices, faces=np.array([[0, 1, 99]]))
+    # Unequal numbers of entries and exits never become a path.
+    solid = MeshSolid(mesh=CUBE, material="Al")
+    solid.tracer.normal[:] = np.abs(solid.tracer.normal)
+    with pytest.raises(EngineFailedError):
+        mesh_paths(solid, [50.0, 0.1, 0.2], [[-1.0, 0, 0]])
+
+
+def test_stl_there_and_back(tmp_path):
+    pytest.importorskip("trimesh")
+    write_stl(tmp_path / "cube.stl", CUBE)
+    mesh = read_mesh(tmp_path / "cube.stl", scale=2.0)
+    assert mesh.volume == pytest.approx(64.0)
+    with pytest.raises(FileError):
+        read_mesh(tmp_path / "none.stl")
+
+
+def test_the_specimen_is_closed_and_as_long_as_the_paper_s():
+    mesh = specimen_mesh(edge=3.0, segments=60).require_closed()
+    assert np.ptp(mesh.vertices[:, 2]) == pytest.approx(LENGTH)
+    lengths = [m.length for m in measurands()]
+    assert len(lengths) == 7
+    assert min(lengths) == 4.0
+    assert max(lengths) == 12.0
+    for m in measurands():
+        assert np.linalg.norm(m.a - m.b) == pytest.approx(m.length)
+    made = specimen_mesh(deviations=True, edge=3.0, segments=60, seed=4).require_closed()
+    moved = np.linalg.norm(made.vertices - mesh.vertices, axis=1)
+    assert 0.001 < moved.max() < 0.04
+    assert (moved == 0).mean() > 0.1
+
+
+def test_tessellated_shapes_have_their_volume():
+    solids = (
+        Solid(shape=cylinder(3, -2, 5) - cylinder(1, -3, 6), material="Al"),
+        Solid(shape=cone(3, 1, 0, 4).placed(t=[20, 0, 0]), material="Al"),
+        Solid(shape=torus(4, 1).placed(t=[40, 0, 0]), material="Al"),
+        Solid(shape=box(2, 3, 4).placed(t=[60, 0, 0]) & half_space().placed(t=[60, 0, 0]), material="Al"),
+        Solid(shape=sphere(2).placed(t=[80, 0, 0]), material="Al"),
+    )
+    pi = np.pi
+    exact = [7 * pi * 8, pi * 4 / 3 * 13, 2 * pi**2 * 4, 12.0, 4 / 3 * pi * 8]
+    for (mesh, _, _), volume in zip(tessellate(solids, segments=200), exact, strict=True):
+        assert mesh.volume == pytest.approx(volume, rel=2e-3)
+
+
+def test_the_image_of_a_mesh_is_that_of_the_shape():
+    scanner = Scanner(d_SD=800.0, d_SR=200.0, p_u=0.4, p_v=0.5, u_0=41.3, v_0=38.7, n_u=81, n_v=77)
+    mount = RigidTransform.from_angles([0.1, 0.2, 3.0], [0.2, 0.1, 0.3], source=Frame.H, target=Frame.T)
+    poses = PoseSequence.from_table([[0, 0, 0]], [[0, 0, 0]])
+    solids = (Solid(shape=sphere(2.5), material="Al"),)
+    run = simulate_ball_run(scanner, T_HT=mount, t=np.zeros(3), poses=poses, ball_diameter=5.0, solids=solids)
+    meshed = replace(run, solids=(), meshes=(MeshSolid(mesh=ball(6), material="Al"),))
+    a, b = transmission(run, 0), transmission(meshed, 0)
+    assert a.min() < 0.9
+    # 32,768 triangles: facets lie up to 0.4 um inside the sphere, 13 um of path at the rim.
+    np.testing.assert_allclose(a, b, atol=1e-3)
