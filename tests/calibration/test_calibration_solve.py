@@ -10,6 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from tomopose import RigidTransform
 from tomopose.calibration.apply import projection_matrices
+from tomopose.calibration.estimate import best_fit
+from tomopose.calibration.parameters import free_parameters
+from tomopose.calibration.problem import pair
 from tomopose.calibration.solve import calibrate
 from tomopose.errors import InputError, NotObservableError
 from tomopose.geometry.frames import Frame
@@ -63,6 +66,20 @@ def test_exact_centres_give_the_exact_mount(scanner, rng, plan):
         np.testing.assert_allclose(projection_matrices(cal, scan).project(x_W), expected, rtol=0, atol=1e-6)
         assert cal.d_rms < 1e-9
         assert cal.pose_id == poses.pose_id
+
+
+@pytest.mark.parametrize("plan", ["grid", "mixed", "turned"])
+def test_a_thousand_mounts_are_found_from_no_start(scanner, rng, plan):
+    """Exact centres, 1e-9 mm and rad, whatever the mount; in "turned" the poses rotate by up to 180 degrees."""
+    poses = {"grid": grid_poses(2), "mixed": mixed_poses(rng, 30), "turned": PoseSequence.from_table(
+        rng.uniform(-9, 9, (30, 3)), rng.uniform(-180, 180, (30, 3)))}[plan]
+    free = free_parameters((scanner,))
+    for _ in range(1000 if plan == "grid" else 150):
+        T_HT, t = any_mount(rng), rng.uniform(-10, 10, 3)
+        fit = best_fit(pair(scanner, poses, observe(scanner, poses, T_HT, t)), free)
+        assert fit.converged
+        assert np.linalg.norm(log_rotation(fit.R_HT @ T_HT.R.T)) < 1e-9
+        assert np.abs(np.concatenate([fit.t_HT - T_HT.t, fit.t[0] - t])).max() < 1e-9
 
 
 def test_several_balls_have_one_centre_each(scanner, T_HT, rng):

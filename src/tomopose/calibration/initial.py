@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from tomopose.calibration.problem import Problem
 from tomopose.units import Array
 
-ROUNDS = 3
+ROUNDS = 2
 RANK_TOLERANCE = 1e-9
 MOVED_SOURCE = 1e-3
 """The source counts as moved in T when it moves by more than this part of its distance."""
