@@ -118,7 +118,7 @@ def calibrate_kinematic(
         candidates.append(("kinematic", machine))
     if model == "slack":
         candidates += map_candidates(problem, start)
-    fits = _fit_all(problem, start, candidates, robust)
+    fits = _fit_all(problem, start, candidates, robust, needed="kinematic" if model == "kinematic" else "rigid")
     doubts = _sound_run(fits, problem)
     judged = {name: judge(name, fit) for name, fit in fits.items()}
     chosen = _choose(model, judged)
@@ -192,19 +192,28 @@ def _known_bars(
 
 
 def _fit_all(
-    problem: KinematicProblem, start: State, candidates: Sequence[tuple[str, ErrorModel | None]], robust: bool
+    problem: KinematicProblem, start: State, candidates: Sequence[tuple[str, ErrorModel | None]], robust: bool,
+    needed: str,
 ) -> dict[str, ModelFit]:
-    """The candidates' fits, simplest first, all on the rows that belong for the richest: evidence compares only so."""
+    """The candidates' fits, simplest first, all on the rows that belong for the richest: evidence compares only so.
+
+    A candidate without an optimum is left out, unless it is the rigid one or the one `needed`.
+    """
     fits: dict[str, ModelFit] = {}
     keep = None
     for name, machine in reversed(candidates):
-        errors = np.zeros(0 if machine is None else len(machine.names))
-        own = replace(problem, model=machine)
-        if keep is None:
-            fits[name] = _with_run_effects(own, fit_model(own, replace(start, p=errors), robust=robust))
-            keep = fits[name].keep
-        else:
-            fits[name] = fit_model(own, replace(start, p=errors), keep=keep)
+        own, begin = replace(problem, model=machine), start
+        if machine is not None:
+            begin = replace(start, p=np.zeros(len(machine.names)))
+        try:
+            if keep is None:
+                fits[name] = _with_run_effects(own, fit_model(own, begin, robust=robust))
+                keep = fits[name].keep
+            else:
+                fits[name] = fit_model(own, begin, keep=keep)
+        except NotConvergedError:
+            if name in ("rigid", needed):
+                raise
     return dict(reversed(fits.items()))
 
 

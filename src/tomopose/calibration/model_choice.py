@@ -33,8 +33,8 @@ class Judgement:
     """How one model did.
 
     log_evidence: at its optimum.  log_predictive: of the held-out centres.  cv_rms: rms distance, px, of the held-out
-    centres from their predictions.  cv_chi2: mean square of the held-out misses in predicted standard deviations, 1 where
-    the model holds all there is.  d_rms: of the fit itself, px.
+    centres from their predictions.  cv_chi2: mean square of the held-out misses in predicted standard deviations,
+    1 where the model holds all there is.  d_rms: of the fit itself, px.
     """
 
     model: str
@@ -50,7 +50,8 @@ class Judgement:
     def to_json(self) -> dict[str, Any]:
         return {
             "model": self.model, "log_evidence": self.log_evidence, "log_predictive": self.log_predictive,
-            "cv_rms_px": self.cv_rms, "cv_chi2": self.cv_chi2, "d_rms_px": self.d_rms, "chi2_dof": self.chi2_dof, "scatter": self.scatter,
+            "cv_rms_px": self.cv_rms, "cv_chi2": self.cv_chi2,
+            "d_rms_px": self.d_rms, "chi2_dof": self.chi2_dof, "scatter": self.scatter,
             "size": self.size,
         }
 
