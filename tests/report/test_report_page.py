@@ -134,6 +134,14 @@ def test_parameters_without_uncertainty_are_not_determinable(sample):
     assert not re.search(r"\b(nan|inf)\b", shown, re.I)
 
 
+def test_images_without_a_ball_stand_beside_the_outliers(sample):
+    calibration, observations, poses = sample()
+    seen = dataclasses.replace(calibration, extra={"not_seen": {"p999": "no ball found"}})
+    html = calibration_report(seen, observations=observations, poses=poses)
+    assert "<td>p999</td><td>no ball found</td>" in html
+    assert f"{len(calibration.outliers) + 1} set aside" in html
+
+
 def test_a_calibration_without_residuals_is_reported_as_such(sample):
     calibration, observations, poses = sample(verdict="rejected")
     empty = dataclasses.replace(

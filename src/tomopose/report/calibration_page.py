@@ -83,7 +83,7 @@ def calibration_report(
     -------
     HTML text; it loads nothing from a network.  Parts that were not given are named as such.
     """
-    n, left = len(calibration.pose_id), len(calibration.outliers)
+    n, left = len(calibration.pose_id), len(set_aside(calibration))
     sections = [
         _parameters(calibration),
         *_data_sections(calibration, observations=observations, poses=poses, thumbnails=thumbnails, scan=scan),
@@ -253,14 +253,15 @@ def _detections(
     calibration: Calibration, joined: Joined, observations: BallObservations | None, thumbnails: Sequence[Thumbnail]
 ) -> Section:
     blocks: list[Block] = []
-    if calibration.outliers:
+    aside = set_aside(calibration)
+    if aside:
         blocks.append(
             Table(
                 title="Set aside",
                 meaning="Images that do not take part in the result, and why.",
                 columns=["pose", "reason"],
-                rows=[[p, reason] for p, reason in calibration.outliers.items()],
-                wide=len(calibration.outliers) > 8,
+                rows=[[p, reason] for p, reason in aside.items()],
+                wide=len(aside) > 8,
             )
         )
     else:
@@ -280,6 +281,12 @@ def _detections(
         blocks.append(Words(title="Worst detections", paragraphs=[f"Radiographs: {NOT_GIVEN}, so no pictures."]))
     blocks.append(_pose_table(joined, observations))
     return Section(title="Detections", lead="The images behind the numbers.", blocks=blocks)
+
+
+def set_aside(calibration: Calibration) -> dict[str, str]:
+    """Poses that do not take part, with the reason: no ball measured, or an outlier of the fit."""
+    not_seen = calibration.extra.get("not_seen")
+    return {**(not_seen if isinstance(not_seen, Mapping) else {}), **calibration.outliers}
 
 
 def _pose_table(joined: Joined, observations: BallObservations | None) -> Table:

@@ -24,7 +24,9 @@ MODEL_HEADINGS: Mapping[str, str] = MappingProxyType(
         "log_predictive": "log predictive",
     }
 )
-KNOWN = ("integrity", "models", "model_chosen", "by_rotation", "pose_noise", "widening", "expected_residual_px")
+KNOWN = (
+    "integrity", "models", "model_chosen", "by_rotation", "pose_noise", "widening", "expected_residual_px", "not_seen",
+)
 
 
 def checks_section(calibration: Calibration) -> Section | None:
