@@ -160,7 +160,7 @@ def agreement(n: int = 256, views: int = 30) -> Result:
     """Against RTK's own SART filter, fed view by view in our order."""
     grid = VoxelGrid.cube(n=n, spacing=0.1)
     objects = balls(grid)
-    matrices = scan(grid, n=views, n_u=n * 400 // 256, field=1.4)
+    matrices = scan(grid, n=views, n_u=n * 400 // 256)
     images = images_of(matrices, objects)
     own = reconstruct(
         images, matrices, grid, images_are="line-integrals", consistency="off", engine="cpu", **PAPER

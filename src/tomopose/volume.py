@@ -27,7 +27,7 @@ class VoxelGrid:
     """
 
     shape: tuple[int, int, int]
-    spacing: Array
+    spacing: Any
     centre: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:

@@ -68,7 +68,7 @@ def test_a_missing_package_is_named_with_its_install_line(module, extra, monkeyp
             raise ImportError(f"No module named {name!r}")
         return real(name, *rest, **named)
 
-    import importlib.metadata as metadata
+    from importlib import metadata
 
     def absent(name):
         raise metadata.PackageNotFoundError(name)

@@ -46,11 +46,15 @@ def tilt_eq11(alpha: np.ndarray) -> np.ndarray:
 
 def scan(
     grid: VoxelGrid, *, n: int, n_u: int, n_v: int | None = None, tilted: bool = True, arc: float = 2 * np.pi,
-    aspect: float = 1.0, shift: tuple[float, float] = (0.3, -0.2), field: float = 1.15,
+    aspect: float = 1.0, shift: tuple[float, float] = (0.3, -0.2), field: float | None = None,
 ) -> ProjectionMatrices:
-    """Matrices of the paper's setup at magnification 5, the detector `field` times the grid's edge wide."""
+    """Matrices of a setup like the paper's, at magnification 5.
+
+    At the rotation axis a pixel is as wide as a voxel, as in the paper (0.4 mm / 5.3 = 75.5 um), unless `field` says
+    that the detector is that many times the grid's edge wide.
+    """
     edge = float(grid.spacing[0] * grid.n_xyz[0])
-    p_u = edge * 5.0 * field / n_u
+    p_u = float(grid.spacing[0]) * 5.0 if field is None else edge * 5.0 * field / n_u
     n_v = n_u if n_v is None else n_v
     scanner = Scanner(
         d_SD=1500.0, d_SR=300.0, p_u=p_u, p_v=p_u * aspect, u_0=(n_u - 1) / 2 + shift[0], v_0=(n_v - 1) / 2 + shift[1],
