@@ -6,55 +6,43 @@ poses hold enough to find its errors, given its nominal geometry and how far its
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri
 
 from tomopose.calibration.kinematic_fit import ModelFit, fit_model
-from tomopose.calibration.kinematic_solve import KinematicProblem, State, singular_values
-from tomopose.calibration.model_choice import EVIDENCE_GAIN, Judgement, better, by_rotation, judge
+from tomopose.calibration.kinematic_result import calibration_of, comparison
+from tomopose.calibration.kinematic_solve import KinematicProblem, State
+from tomopose.calibration.model_choice import EVIDENCE_GAIN, Judgement, better, judge
 from tomopose.calibration.multi_ball import require_balls_not_swapped
 from tomopose.calibration.parameters import (
     FreeParameters,
-    adjusted_scanners,
     free_parameters,
-    translation_scale,
-    unit_of,
 )
 from tomopose.calibration.problem import Problem, pair
-from tomopose.calibration.result import Calibration, Observability, Parameter
+from tomopose.calibration.result import Calibration
 from tomopose.calibration.run_changes import change_in_words, find_change, require_same_pivot
-from tomopose.calibration.slack import determined_turns, map_candidates
-from tomopose.calibration.uncertainty import WIDENING_PROBABILITY, angles_by_tangent
+from tomopose.calibration.slack import map_candidates
 from tomopose.errors import InputError, NotConvergedError
 from tomopose.geometry.frames import Frame
-from tomopose.geometry.rotations import angles_from_rotation
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.manipulator.error_models import manipulator_block
 from tomopose.manipulator.files import hexapod_from_document, read_manipulator, serial_from_document
 from tomopose.manipulator.hexapod import Hexapod
 from tomopose.manipulator.inverse import InverseManipulator
 from tomopose.manipulator.pose_map import PoseMap
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import ErrorModel, Repeatability
-from tomopose.manipulator.run_effects import WithRunEffects, with_run_effects
+from tomopose.manipulator.run_effects import with_run_effects
 from tomopose.manipulator.serial import SerialRobot
 from tomopose.observations import BallObservations
-from tomopose.provenance import provenance
 from tomopose.units import Array
 
 MODELS = ("auto", "rigid", "kinematic", "slack")
-RUN_EFFECTS_FOUND = (
-    "during the run the manipulator drifted or its drives lagged (drift and lag are among the parameters): the scan "
-    "may be off by as much again"
-)
-LARGE_SCATTER = 9.0
-"""A scatter whose variance is this many times the stated one means an error that no model here holds."""
+
 
 
 def calibrate_kinematic(
@@ -123,8 +111,8 @@ def calibrate_kinematic(
     judged = {name: judge(name, fit) for name, fit in fits.items()}
     chosen = _choose(model, judged)
     if chosen == "rigid" and model == "auto":
-        return replace(rigid, extra={**rigid.extra, **_comparison(judged, fits, chosen)})
-    return _calibration(rigid, fits, judged, chosen, model, data.pose_id, doubts)
+        return replace(rigid, extra={**rigid.extra, **comparison(judged, fits, chosen)})
+    return calibration_of(rigid, fits, judged, chosen, model, data.pose_id, doubts)
 
 
 def machine_of(manipulator: Any) -> ErrorModel | None:
@@ -253,136 +241,3 @@ def _choose(model: str, judged: Mapping[str, Judgement]) -> str:
         if name != "rigid" and better(judged[name], judged[chosen]):
             chosen = name
     return chosen
-
-
-def _comparison(
-    judged: Mapping[str, Judgement], fits: Mapping[str, ModelFit], chosen: str
-) -> dict[str, Any]:
-    """What the report shows: the models side by side, and their residuals by axis of rotation."""
-    shown = dict.fromkeys(("rigid", chosen if chosen != "rigid" else list(fits)[-1]))
-    problem = fits["rigid"].estimate.problem
-    residuals = {name: fits[name].estimate.at.r for name in shown}
-    return {
-        "models": [j.to_json() for j in judged.values()],
-        "model_chosen": chosen,
-        "by_rotation": by_rotation(problem.poses, residuals, problem.data.scanner),
-    }
-
-
-def _parameters(fit: ModelFit) -> tuple[Parameter, ...]:
-    e, free = fit.estimate, fit.estimate.problem.free
-    u = np.sqrt(np.diag(e.covariance))
-    E = angles_by_tangent(e.state.T_HT.R)
-    u_angles = np.sqrt(np.einsum("ij,jk,ik->i", E, e.covariance[:3, :3], E))
-    result = [
-        Parameter(name=f"phi_HT_{c}", value=float(a), u=float(s), unit="rad")
-        for c, a, s in zip("xyz", angles_from_rotation(e.state.T_HT.R), u_angles, strict=True)
-    ]
-    values = np.concatenate([e.state.T_HT.t, e.state.balls.ravel(), free.value + e.state.delta, e.state.p])
-    model = e.problem.model
-    units = (
-        *("mm",) * (3 + e.state.balls.size), *(unit_of(n) for n in free.names), *(() if model is None else model.units)
-    )
-    result += [
-        Parameter(name=n, value=float(v), u=float(s), unit=unit)
-        for n, v, s, unit in zip(e.problem.tangent[3:], values, u[3:], units, strict=True)
-    ]
-    return tuple(result)
-
-
-def _calibration(
-    rigid: Calibration, fits: Mapping[str, ModelFit], judged: Mapping[str, Judgement], chosen: str, asked: str,
-    ids: tuple[str, ...], doubts: tuple[str, ...],
-) -> Calibration:
-    fit = fits[chosen]
-    e = fit.estimate
-    problem, model = e.problem, e.problem.model
-    data = problem.data
-    block: dict[str, Any] = {}
-    notes: list[str] = []
-    if model is not None:
-        before = len(e.problem.tangent) - len(model.names)
-        if isinstance(model, WithRunEffects):
-            model = model.machine  # drift and lag of this run are no property of the machine
-            doubts = (*doubts, RUN_EFFECTS_FOUND)
-        m = len(model.names)
-        u = np.sqrt(np.diag(e.covariance))[before : before + m]
-        block = manipulator_block(model, e.state.p[:m], u, problem.poses)
-        scale = translation_scale(problem.free, e.state.delta)
-        block |= {"translation_scale": scale} if scale != 1.0 else {}
-        gamma = m - float(np.sum((u / model.sigma) ** 2))
-        notes.append(
-            f"the radiographs determine {gamma:.1f} of {m} errors of the manipulator; the others, and shifts and turns "
-            "of whole plates, which the mount and the ball take up, stay at their priors"
-        )
-    block["scatter"] = {
-        "t_mm": problem.repeatability.t_mm * np.sqrt(problem.scatter),
-        "w_rad": problem.repeatability.w_rad * np.sqrt(problem.scatter),
-    }
-    reasons = [*doubts, *_doubts(fit, judged, chosen)]
-    if asked == "slack":
-        sentence = determined_turns(e)
-        if sentence:
-            reasons.append(sentence)
-    outliers = {
-        str(i): f"residual beyond what a clean run allows: {d:.1f} standard deviations"
-        for i, d, k in zip(ids, np.sqrt(fit.distance2), fit.keep, strict=True) if not k
-    }
-    name = "slack" if asked == "slack" else chosen
-    scanners = adjusted_scanners(data.scanners, problem.free, e.state.delta)
-    return Calibration(
-        scanner=scanners[0],
-        T_HT=e.state.T_HT,
-        balls=dict(zip(data.ball_ids, e.state.balls, strict=True)),
-        tangent=problem.tangent,
-        covariance=e.covariance,
-        pose_id=data.pose_id,
-        x_D=data.x_D,
-        residuals=e.at.r,
-        chi2=e.chi2,
-        dof=e.dof,
-        parameters=_parameters(fit),
-        observability=Observability(singular_values=singular_values(e), notes=tuple(notes)),
-        outliers=outliers,
-        model=name,
-        manipulator=block,
-        converged=True,
-        status=f"optimum of {len(data)} poses reached with the {name} model",
-        verdict="doubtful" if reasons else "trustworthy",
-        reasons=tuple(reasons),
-        hypotheses=rigid.hypotheses,
-        pivot=data.pivot,
-        convention=data.convention,
-        extra={
-            **{k: v for k, v in rigid.extra.items() if k in ("not_seen",)},
-            **({"scanners": scanners} if len(scanners) > 1 else {}),
-            **_comparison(judged, fits, chosen),
-        },
-        provenance=provenance(
-            arguments={**({} if rigid.provenance is None else dict(rigid.provenance.arguments)), "model": asked}
-        ),
-    )
-
-
-def _doubts(fit: ModelFit, judged: Mapping[str, Judgement], chosen: str) -> Iterator[str]:
-    """Why a result is to be used with care."""
-    e = fit.estimate
-    if fit.scatter > LARGE_SCATTER:
-        r = e.problem.repeatability
-        um, urad = 1000 * r.t_mm * np.sqrt(fit.scatter), 1e6 * r.w_rad * np.sqrt(fit.scatter)
-        yield (
-            f"poses scatter {np.sqrt(fit.scatter):.1f} times as much as the manipulator's repeatability says "
-            f"({um:.2g} um, {urad:.2g} urad): an error that this model does not hold (backlash, drift)"
-        )
-    elif e.chi2 > chdtri(max(e.dof, 1), WIDENING_PROBABILITY) and e.dof > 0:
-        yield f"chi2/dof is {e.chi2 / e.dof:.2f}: the stated uncertainties do not explain the residuals"
-    if chosen != "rigid" and not better(judged[chosen], judged["rigid"]):
-        yield (
-            f"held-out poses are not predicted better than by trusting the poses ({judged[chosen].cv_rms:.4f} px, "
-            f"rigid {judged['rigid'].cv_rms:.4f} px); use model auto"
-        )
-    if fit.size > 5.0:
-        yield (
-            f"the identified errors are {fit.size:.1f} times as large as the machine's file says; check its geometry "
-            "and units"
-        )
