@@ -18,7 +18,7 @@ from tomopose.report.png import grey_levels, grey_png
 from tomopose.report.residual_figures import by_pose, quantiles, quiver, rotation_table
 from tomopose.report.scene_figures import ball_in_world, panel_corners
 from tomopose.report.thumbnails import Thumbnail, ellipse_outline, thumbnail, thumbnail_svg, worst_thumbnails
-from tomopose.report.words import cell, heading, meaning, number, small_unit, symbol
+from tomopose.report.words import cell, decimals, heading, meaning, number, small_unit, symbol
 
 
 def decode_png(png: bytes) -> np.ndarray:
@@ -164,7 +164,7 @@ def test_arrows_begin_at_the_ball_and_follow_the_residual(sample):
     calibration, observations, poses = sample()
     joined = join(calibration, observations=observations, poses=poses)
     figure = quiver(calibration, joined)
-    scale = float(re.search(r"drawn ([\d.e+]+) times", figure.meaning)[1])
+    scale = float(re.search(r"drawn at ([\d.e+]+) times", figure.meaning)[1])
     u, v = figure.data[0]["x"], figure.data[0]["y"]
     base, tip = np.array([u[0], v[0]]), np.array([u[1], v[1]])
     np.testing.assert_allclose(base, calibration.x_D[0])
@@ -223,6 +223,11 @@ def test_minutes_since_the_first_pose():
 )
 def test_numbers_have_three_figures(value, text):
     assert number(value) == text
+
+
+@pytest.mark.parametrize(("rms", "digits"), [(308.0, 0), (2.0, 2), (0.0268, 4), (0.000423, 6), (0.0, 3)])
+def test_columns_show_three_figures_of_their_rms(rms, digits):
+    assert decimals([rms, -rms, rms]) == digits
 
 
 def test_words_for_names_and_units():

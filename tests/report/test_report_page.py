@@ -149,7 +149,7 @@ def test_a_calibration_without_residuals_is_reported_as_such(sample):
     )
     html = calibration_report(empty, observations=observations, poses=poses)
     assert "it ended before poses were fitted" in html
-    assert "Not converged." in html
+    assert "Not converged:" in html
     assert figures_of(html) == {}
 
 

@@ -124,7 +124,7 @@ def _data_sections(
 def _verdict(calibration: Calibration) -> Verdict:
     sentence = calibration.status or "The solver gave no sentence about how it ended."
     if not calibration.converged:
-        sentence = "Not converged. " + sentence
+        sentence = "Not converged: " + sentence
     return Verdict(
         word=calibration.verdict.capitalize(),
         sentence=sentence,

@@ -63,7 +63,7 @@ def quiver(calibration: Calibration, joined: Joined) -> Figure:
     ]
     return Figure(
         title="Residuals on the detector",
-        meaning=f"Each arrow is observed minus calculated ball centre, drawn {scale:g} times longer than it is.",
+        meaning=f"Each arrow is observed minus calculated ball centre, drawn at {scale:g} times its length.",
         look_for="Arrows of random direction are noise; a swirl, a common direction or growth towards one side is an "
         "error of the geometry (roll, tilt, distance) or of the manipulator.",
         data=data,
@@ -204,7 +204,7 @@ def rotation_table(calibration: Calibration, joined: Joined) -> Table | None:
     to_um = np.sqrt(calibration.scanner.p_u * calibration.scanner.p_v) / calibration.scanner.magnification * 1000.0
     groups = np.array(joined.group)
     rows = []
-    k_px, k_um = decimals(joined.d), decimals(joined.d * to_um, fewest=2)
+    k_px, k_um = decimals(joined.d), decimals(joined.d * to_um)
     for name in [g for g in ROTATION_COLOURS if (groups == g).any()]:
         k = groups == name
         rms = float(np.sqrt(np.mean(joined.d[k] ** 2)))

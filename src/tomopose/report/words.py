@@ -92,11 +92,11 @@ def with_unit(value: Any, unit: str) -> str:
     return f"{number(value)} {unit}" if math.isfinite(float(value)) else NOT_DETERMINABLE
 
 
-def decimals(values: Any, *, fewest: int = 4) -> int:
-    """Digits after the point that show two figures of the rms of values, never fewer than `fewest`."""
+def decimals(values: Any) -> int:
+    """Digits after the point that show three figures of the rms of values."""
     x = np.asarray(values, dtype=np.float64)
     rms = float(np.sqrt(np.mean(x**2))) if x.size else 0.0
-    return max(fewest, 1 - math.floor(math.log10(rms))) if math.isfinite(rms) and rms > 0 else fewest
+    return max(0, 2 - math.floor(math.log10(rms))) if math.isfinite(rms) and rms > 0 else 3
 
 
 def cell(value: Any) -> str:
