@@ -122,6 +122,13 @@ def test_out_of_reach_is_named(rng: np.random.Generator) -> None:
     limited = replace(machine, leg_limits=(249.0, 251.0))
     with pytest.raises(OutOfReachError, match=r"legs of .* mm, outside 249 to 251"):
         limited.real_poses(poses, np.zeros(len(machine.names)))
+    far = PoseSequence.from_table([[0, 0, 0], [0, 0, 600.0]], np.zeros((2, 3)))
+    with pytest.raises(OutOfReachError, match="outside half or twice their length at home") as caught:
+        machine.real_poses(far, np.zeros(len(machine.names)))
+    assert caught.value.indices == (1,)
+    below = PoseSequence.from_table([[0, 0, -500.0]], np.zeros((1, 3)))
+    with pytest.raises(OutOfReachError, match="lean by more than 90 deg"):
+        machine.real_poses(below, np.zeros(len(machine.names)))
     with pytest.raises(OutOfReachError, match="cannot be reached"):
         machine.forward(np.full((1, 6), 20.0), np.eye(3)[None], np.zeros((1, 3)))
 

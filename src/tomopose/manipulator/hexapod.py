@@ -44,6 +44,7 @@ GROUPS = (
     "base_joint", "platform_joint", "leg_offset", "geometry_scale", "geometry_base_radius", "leg_scale", "axes", "pivot"
 )
 GEOMETRY_COLUMNS = {"geometry_scale": slice(0, 1), "geometry_base_radius": slice(1, 5)}
+LARGEST_STROKE = 2.0
 SINGULAR_CONDITION = 1e5
 """Condition of A (lengths in units of the platform's radius) above which a pose counts as singular."""
 
@@ -179,7 +180,7 @@ class Hexapod:
                 J_legs[:, :, part[group][0]] += _legs_by_geometry(
                     self.base_joints, self.platform_joints, A_nominal[:, :, 3:], R
                 )[..., columns]
-        self._require_limits(legs)
+        self._require_reach(legs, A_nominal[:, :, 3:])
         db = part.get("base_joint", (None, none))[1]
         dp = part.get("platform_joint", (None, none))[1]
         b = b + (db.reshape(6, 3) if db.size else 0.0)
@@ -219,15 +220,29 @@ class Hexapod:
             rhs[:, :, part["leg_scale"][0]] += legs[:, :, None] * np.eye(6)
         return np.asarray(np.linalg.solve(A, rhs), dtype=np.float64)
 
-    def _require_limits(self, legs: Array) -> None:
-        if self.leg_limits is None:
-            return
-        low, high = self.leg_limits
+    def _require_reach(self, legs: Array, direction: Array) -> None:
+        """OutOfReachError where legs leave their limits.
+
+        Without stated limits none may grow beyond twice its length at home or shrink below half of it, since a spindle
+        is no longer than its tube, and none may lean over by a right angle from where it points at home.
+        """
+        home, A_home = self.legs(np.eye(3)[None], np.zeros((1, 3)))
+        leaning = np.flatnonzero((np.einsum("nki,ki->nk", direction, A_home[0, :, 3:]) <= 0).any(axis=1))
+        if leaning.size:
+            raise OutOfReachError(
+                f"{leaning.size} poses make a leg lean by more than 90 deg from home; the first is pose {leaning[0]}: "
+                "this platform cannot take them; check the joints' order, signs and units",
+                indices=leaning.tolist(),
+            )
+        low, high = self.leg_limits or (home[0] / LARGEST_STROKE, home[0] * LARGEST_STROKE)
         bad = np.flatnonzero(((legs < low) | (legs > high)).any(axis=1))
         if bad.size:
+            limits = f"half or twice their length at home ({home.min():.1f} to {home.max():.1f} mm)"
+            if self.leg_limits is not None:
+                limits = "{:g} to {:g} mm".format(*self.leg_limits)
             raise OutOfReachError(
-                f"{bad.size} poses need legs of {legs[bad].min():.2f} to {legs[bad].max():.2f} mm, outside "
-                f"{low:g} to {high:g} mm; the first is pose {bad[0]}",
+                f"{bad.size} poses need legs of {legs[bad].min():.2f} to {legs[bad].max():.2f} mm, outside {limits}; "
+                f"the first is pose {bad[0]}; check the joints' coordinates and the poses' units",
                 indices=bad.tolist(),
                 limits=self.leg_limits,
             )
