@@ -140,6 +140,10 @@ def fit_model(
         estimate = solve_softened(problem if keep.all() else problem.rows(keep), start)
     estimate = with_scatter(estimate)
     estimate, size = with_size(estimate) if resize else (estimate, 1.0)
+    if size > 1.0 and estimate.problem.scatter > 1.0:
+        # what looked like scatter may have been errors larger than stated
+        quiet = with_scatter(solve_softened(replace(estimate.problem, scatter=1.0), estimate.state))
+        estimate = max(estimate, quiet, key=lambda e: e.log_evidence)
     whole = replace(problem, scatter=estimate.problem.scatter, model=estimate.problem.model)
     return ModelFit(estimate=estimate, keep=keep, distance2=distances(estimate, whole, keep), size=size)
 
