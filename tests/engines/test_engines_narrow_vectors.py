@@ -9,7 +9,7 @@ import sys
 PROGRAM = """
 import sys
 import llvmlite.binding
-llvmlite.binding.get_host_cpu_features = dict
+llvmlite.binding.get_host_cpu_features = llvmlite.binding.targets.FeatureMap  # no feature at all
 sys.path.insert(0, sys.argv[1])
 import numpy as np
 from test_engines_agree import GRID, views
