@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.result import Calibration, Parameter
+from tomopose.calibration.result import Calibration
 from tomopose.geometry.projection import ProjectionMatrices
-from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.report import coverage_figures, residual_figures, scene_figures
 from tomopose.report.checks_section import checks_section
 from tomopose.report.gather import Joined, join
 from tomopose.report.history_page import history_section
+from tomopose.report.observability_section import observability_section
 from tomopose.report.page import (
     BAD,
     CARE,
@@ -30,32 +30,23 @@ from tomopose.report.page import (
     Words,
     render,
 )
+from tomopose.report.parameters_section import parameters_section
 from tomopose.report.provenance_section import provenance_section
 from tomopose.report.thumbnails import Thumbnail
 from tomopose.report.words import (
     NOT_DETERMINABLE,
     NOT_GIVEN,
-    cell,
     decimals,
-    heading,
-    meaning,
     number,
-    small_unit,
     with_unit,
 )
-from tomopose.units import value_with_uncertainty
 
 TONES: Mapping[str, Any] = {"trustworthy": GOOD, "doubtful": CARE, "rejected": BAD}
-COVERAGE_FACTOR = 2.0
-HYPOTHESIS_COLUMNS = ("words", "verdict", "d_rms_px", "delta_chi2", "cure")
 NO_DOUBT: Mapping[str, tuple[str, ...]] = {
     "trustworthy": ("none of the checks gave a reason for doubt",),
     "doubtful": (),
     "rejected": (),
 }
-MANY_PARAMETERS = 12
-MACHINE_LISTS = ("names", "values", "units", "u", "nominal")
-"""Parts of `Calibration.manipulator` that stand in the tables of parameters already, or in its input file."""
 
 
 def calibration_report(
@@ -85,7 +76,7 @@ def calibration_report(
     """
     n, left = len(calibration.pose_id), len(set_aside(calibration))
     sections = [
-        _parameters(calibration),
+        parameters_section(calibration),
         *_data_sections(calibration, observations=observations, poses=poses, thumbnails=thumbnails, scan=scan),
         *(section for section in (checks_section(calibration), history_section(history)) if section is not None),
         provenance_section(calibration.provenance),
@@ -115,7 +106,7 @@ def _data_sections(
     return [
         _residuals(calibration, joined),
         _detections(calibration, joined, observations, thumbnails),
-        _observability(calibration),
+        observability_section(calibration),
         _coverage(calibration, joined, observations),
         _scene(calibration, joined, scan),
     ]
@@ -162,71 +153,6 @@ def _key_figures(calibration: Calibration, scan: ProjectionMatrices | None) -> l
             )
         )
     return keys
-
-
-def _parameters(calibration: Calibration) -> Section:
-    names = calibration.manipulator.get("names")
-    machine = set(names) if isinstance(names, (list, tuple)) else set()
-    T_HT = calibration.T_HT
-    blocks: list[Block] = [
-        _parameter_table(
-            [p for p in calibration.parameters if p.name not in machine],
-            title="Parameters",
-            words="The figures in brackets are the standard uncertainty in units of the last digits; U is the expanded "
-            "uncertainty, k = 2.",
-        ),
-        _transform_table(T_HT, "T_HT: from the manipulator's base H to the table T"),
-        _transform_table(T_HT.inv, "T_TH: from the table T to the manipulator's base H"),
-    ]
-    errors = [p for p in calibration.parameters if p.name in machine]
-    if errors:
-        blocks.append(
-            _parameter_table(
-                errors, title="Identified errors of the manipulator",
-                words="What the model found beside the mount, as corrections of the machine's stated geometry. Errors "
-                "that the poses cannot tell stay near zero with the uncertainty of their prior.",
-            )
-        )
-    facts = [[heading(k), cell(v)] for k, v in calibration.manipulator.items() if k not in MACHINE_LISTS]
-    if facts:
-        blocks.append(Table(title="The manipulator's model", meaning="", columns=["", ""], rows=facts))
-    pivot = NOT_GIVEN if calibration.pivot is None else ", ".join(f"{x:.4f}" for x in calibration.pivot) + " mm"
-    blocks.append(
-        Words(
-            items=[
-                f"Pivot of the controller: {pivot}. A scan with another pivot needs another calibration.",
-                "T_AB takes coordinates in A to coordinates in B. Angles are those of R = R_x R_y R_z.",
-            ]
-        )
-    )
-    return Section(title="What was found", lead="How the manipulator sits on the table, and where the ball is.",
-                   blocks=blocks)
-
-
-def _parameter_table(parameters: Sequence[Parameter], *, title: str, words: str) -> Table:
-    rows = []
-    for p in parameters:
-        degrees = f"{np.degrees(p.value):.6f}°" if p.unit == "rad" else ""
-        rows.append(
-            [p.name, meaning(p.name), value_with_uncertainty(p.value, p.u, p.unit), degrees, small_unit(p.u, p.unit),
-             small_unit(COVERAGE_FACTOR * p.u, p.unit)]
-        )
-    return Table(
-        title=title, meaning=words, columns=["parameter", "what it is", "value", "in degrees", "u", "U (k = 2)"],
-        rows=rows, numeric=(2, 3, 4, 5), folded=len(rows) > 2 * MANY_PARAMETERS,
-    )
-
-
-def _transform_table(T: RigidTransform, title: str) -> Table:
-    angles = ", ".join(f"{a:.5f}°" for a in np.degrees(T.angles))
-    return Table(
-        title=title,
-        meaning=f"Angles {angles}; t in mm.",
-        columns=["R", "", "", "t / mm"],
-        rows=[[*(f"{x:.9f}" for x in T.R[k]), f"{T.t[k]:.6f}"] for k in range(3)],
-        numeric=(0, 1, 2, 3),
-        wide=False,
-    )
 
 
 def _residuals(calibration: Calibration, joined: Joined) -> Section:
@@ -312,66 +238,6 @@ def _pose_table(joined: Joined, observations: BallObservations | None) -> Table:
         numeric=range(2, 9),
         folded=True,
     )
-
-
-def _observability(calibration: Calibration) -> Section:
-    seen = calibration.observability
-    blocks: list[Block] = []
-    if seen.unobservable:
-        blocks.append(Words(title="Directions that these poses cannot tell", items=seen.unobservable, wide=False))
-        lead = "Some directions of the parameters are not held by these poses."
-    else:
-        blocks.append(
-            Words(title="Directions that these poses cannot tell", paragraphs=["None among the parameters solved for."],
-                  wide=False)
-        )
-        lead = "All parameters solved for are held by these poses."
-    if seen.notes:
-        blocks.append(Words(title="What is taken as known, and what would help", items=seen.notes, wide=False))
-    else:
-        blocks.append(Words(title="What would help", paragraphs=["Nothing was proposed."], wide=False))
-    alike = sum(1 for row in calibration.hypotheses if str(row.get("verdict", "")).startswith("cannot be told apart"))
-    if alike:
-        lead += f" Rival conventions that they cannot tell from the declared one: {alike}, see below."
-    blocks += [coverage_figures.correlation_map(calibration), coverage_figures.singular_values(calibration)]
-    blocks += _hypotheses(calibration.hypotheses)
-    return Section(title="What the poses can tell", lead=lead, blocks=blocks)
-
-
-def _hypotheses(hypotheses: Sequence[Mapping[str, Any]]) -> list[Block]:
-    """Rivals that are still possible, open to view; those that the data exclude, folded away."""
-    if not hypotheses:
-        return [Words(title="Rival conventions", paragraphs=[f"Hypotheses tried: {NOT_GIVEN}."])]
-    present = {key for row in hypotheses for key in row}
-    columns = [c for c in HYPOTHESIS_COLUMNS if c in present] or sorted(present)
-    excluded = [row for row in hypotheses if row.get("verdict") == "excluded"]
-    possible = [row for row in hypotheses if row.get("verdict") != "excluded"]
-    tables = []
-    for title, rows, words in (
-        (
-            "Rival conventions",
-            possible,
-            "Other readings of the same data (orders, signs, flips, pairing), fitted the same way. One that fits about "
-            "as well cannot be told apart with these poses, and one of the two ruins the scan.",
-        ),
-        ("Rival conventions that the data exclude", excluded, "They fit significantly worse."),
-    ):
-        if rows:
-            tables.append(
-                Table(
-                    title=title, meaning=words, columns=[heading(c) for c in columns],
-                    rows=[[_hypothesis_cell(c, row.get(c)) for c in columns] for row in rows],
-                    folded=rows is excluded,
-                )
-            )
-    return list(tables)
-
-
-def _hypothesis_cell(column: str, value: Any) -> str:
-    """Differences of chi2 need no more than a decimal: what is below one is nothing."""
-    if column == "delta_chi2" and value is not None and abs(value) < 1e4:
-        return f"{value:.1f}".replace("-0.0", "0.0")
-    return cell(value)
 
 
 def _coverage(calibration: Calibration, joined: Joined, observations: BallObservations | None) -> Section:
