@@ -173,7 +173,9 @@ def _scanner_mistakes(poses: PoseSequence, t: np.ndarray) -> dict[str, str]:
     wrong = {
         "u_0 + 1 px": {"u_0": FAR.u_0 + 1}, "u_0 + 20 px": {"u_0": FAR.u_0 + 20},
         "d_SR + 1 %": {"d_SR": 1.01 * FAR.d_SR}, "d_SR + 0.05 %": {"d_SR": 1.0005 * FAR.d_SR},
-        "d_SD + 1 %": {"d_SD": 1.01 * FAR.d_SD}, "pitch p_u + 0.5 %": {"p_u": 1.005 * FAR.p_u},
+        "d_SD + 1 %": {"d_SD": 1.01 * FAR.d_SD},
+        "both pitches + 0.5 %": {"p_u": 1.005 * FAR.p_u, "p_v": 1.005 * FAR.p_v},
+        "pitch p_u alone + 0.5 %": {"p_u": 1.005 * FAR.p_u},
         "detector roll 0.5 deg": {"eta": np.radians(0.5)}, "detector roll 0.05 deg": {"eta": np.radians(0.05)},
         "detector tilt 0.5 deg": {"theta": np.radians(0.5)},
     }

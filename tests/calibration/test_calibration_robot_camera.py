@@ -1,0 +1,33 @@
+"""A real robot with a camera in hand: mounts from different corners scatter as their stated uncertainty says."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+STUDY = Path(__file__).resolve().parents[2] / "benchmarks" / "trust" / "robot_camera.py"
+
+
+@pytest.fixture(scope="module")
+def study():
+    spec = importlib.util.spec_from_file_location("robot_camera", STUDY)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["robot_camera"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_spread_of_mounts_agrees_with_the_stated_uncertainty(study, shared_data):
+    found = study.study(shared_data / "robot-camera-kuka", range(3, 408, 17))
+    assert found["residual_px"] == pytest.approx(0.8, abs=0.1)
+    # J^T J takes the robot's errors as independent: too small
+    assert found["plain"].rotation > 1.4
+    modelled = found["modelled"]["poses and camera"]
+    assert 0.8 <= modelled.rotation <= 1.25
+    assert 0.8 <= modelled.mount <= 1.25
+    assert 0.8 <= found["modelled"]["poses"].rotation <= 1.25
