@@ -60,7 +60,7 @@ def silhouette_ellipse(scanner: Scanner, x_D: Array, gamma: float) -> tuple[Arra
     return centre, float(axes[major]), float(axes[1 - major]), angle
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=True)
 def cone_coordinates(u, v, inverse_K, p_u, p_v, u_c, v_c, gamma):  # type: ignore[no-untyped-def]
     """(n, 6): s, ds/du_c, ds/dv_c, ds/dgamma, cos psi, sin psi for pixels u, v (n,).
 

@@ -32,6 +32,9 @@ from tomopose.units import Array
 RUN = 5
 """From this many images on, blur is compared with the run's median: a spot that is not round is no motion."""
 
+OTHER_SIZE = 1.5
+"""Ratio to the run's median radius from which a shape is not the ball: magnification does not vary that much."""
+
 Row = dict[str, Any]
 
 
@@ -217,6 +220,9 @@ def _observations(rows: list[Row], ids: tuple[str, ...] | None, names: tuple[str
     usual = np.zeros(2)
     if seen.sum() >= RUN:
         usual = np.median([row["anisotropy"] for row in rows if "x_D" in row], axis=0)
+        radius = float(np.median([row["radius"] for row in rows if "x_D" in row]))
+        rows = [_of_the_run(row, radius) for row in rows]
+        seen = np.array(["x_D" in row for row in rows], dtype=bool)
 
     def column(name: str, *shape: int) -> Array:
         missing = np.full(shape, np.nan)
@@ -235,6 +241,18 @@ def _observations(rows: list[Row], ids: tuple[str, ...] | None, names: tuple[str
         angle=column("angle"),
         x_ellipse=column("x_ellipse", 2),
     )
+
+
+def _of_the_run(row: Row, radius: float) -> Row:
+    """The row, or a refusal where it shows something of quite another size than the other images."""
+    if "x_D" not in row or abs(math.log(row["radius"] / radius)) < math.log(OTHER_SIZE):
+        return row
+    u, v = row["x_D"]
+    return {
+        "name": row["name"],
+        "reason": f"not found: the shape at ({u:.0f}, {v:.0f}) has a radius of {row['radius']:.1f} px, the ball in the "
+        f"other images {radius:.1f} px",
+    }
 
 
 def _status(row: Row, usual: Array) -> str:

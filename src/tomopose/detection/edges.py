@@ -23,7 +23,7 @@ FIRST_NODE = N_SHAPE + 1
 """Parameters in order: shape (7), w, then a_k, b_k, c_k in turn."""
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=True)
 def model_rows(  # type: ignore[no-untyped-def]
     rim, nodes, white, table, first, step, sigma, gamma_px, box_u, box_v, q_cos, q_sin, value, jacobian, left, share
 ):  # fmt: skip
@@ -87,7 +87,7 @@ def model_rows(  # type: ignore[no-untyped-def]
         jacobian[i, 13] = w * Q
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=True)
 def normal_equations(image, value, jacobian, left, weight, k):  # type: ignore[no-untyped-def]
     """(N, g): weighted normal matrix (8 + 3k, 8 + 3k) and right side J' W (image - value)."""
     size = 8 + 3 * k
@@ -105,7 +105,7 @@ def normal_equations(image, value, jacobian, left, weight, k):  # type: ignore[n
         for p in range(14):
             jw = jacobian[i, p] * w
             right_side[node, p] += jw * r
-            for q in range(p + 1):
+            for q in range(14):
                 block[node, p, q] += jw * jacobian[i, q]
     for node in range(k):
         right = node + 1 if node + 1 < k else 0

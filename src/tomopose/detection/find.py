@@ -26,7 +26,7 @@ FAINT = 0.4
 EQUAL = 0.75
 """A second candidate with this share of the best one's merit makes the image ambiguous."""
 ROUND, FINE_ROUND = 0.08, 0.03
-"""Deviation from a circle, in radii, that a ray may show on a coarse level and on the fine one: a hexagon shows 0.07."""
+"""Deviation from a circle, in radii, that a ray may show on a coarse and on the fine level: a hexagon has 0.07."""
 FINALISTS = 4
 PRIOR = 0.25
 """Width of the preference for the nominal radius, in log radius: loose, for magnification varies with the pose."""
@@ -112,7 +112,7 @@ def _finalists(image: Array, candidates: list[Candidate], aspect: float, expecte
 
 
 def _refined(image: Array, c: Candidate, aspect: float) -> Candidate | None:
-    """The candidate again on a finer image of its surroundings, so that the fit starts within a pixel; None if it is not round."""
+    """The candidate on a finer image of its surroundings, so that the fit starts within a pixel; None if not round."""
     factor = max(1, int(c.radius / 40))
     reach = 1.5 * c.radius + 8
     u, v = max(int(c.u - reach), 0), max(int(c.v - reach / aspect), 0)
@@ -122,8 +122,9 @@ def _refined(image: Array, c: Candidate, aspect: float) -> Candidate | None:
     radius = c.radius / factor
     half = max(2.0, 0.15 * radius)
     yes, x, y, radius, complete, visible, contrast = check_circle(
-        level, (c.u - u - shift) / factor, (c.v - v - shift) / factor, radius - half, radius + half, sign, aspect, 0.0, FINE_ROUND
-    )
+        level, (c.u - u - shift) / factor, (c.v - v - shift) / factor, radius - half, radius + half, sign, aspect, 0.0,
+        FINE_ROUND,
+    )  # fmt: skip
     if not yes or complete < COMPLETE:
         return None
     return Candidate(u=x * factor + shift + u, v=y * factor + shift + v, radius=radius * factor, complete=complete,

@@ -22,6 +22,8 @@ NATIVE = ("uint8", "uint16", "float32", "float64")
 SMALLEST_IMAGE = 16
 WORST_SIGMA = 0.5
 """A centre less certain than this, px, is no measurement."""
+WORST_RIM = 0.1
+"""Residual on the rim, in contrasts, of what still counts as a ball."""
 REGION_MARGIN, REGION_REACH = 24.0, 1.5
 """A region about a predicted position reaches this many radii plus this margin, px."""
 
@@ -139,10 +141,10 @@ def _in_region(
     bad = _bad_pixels(values, mask, box)
     quantum = 1.0 if values.dtype.kind in "ui" else 0.0
     eight_bit = values.dtype.name == "uint8"
-    ceiling = float(np.nanmax(values)) if values.dtype.kind == "f" else float(values.max())
+    if bad is not None and bad.mean() > 0.5:
+        raise BallNotFoundError(f"{100 * bad.mean():.0f} % of the pixels are bad (masked or not finite)")
+    ceiling = float(values.max() if bad is None else values[~bad].max())
     if bad is not None:
-        if bad.mean() > 0.5:
-            raise BallNotFoundError(f"{100 * bad.mean():.0f} % of the pixels are bad (masked or not finite)")
         values = filled(values, bad)
     aspect = scanner.p_v / scanner.p_u
     expected_u = expected * math.sqrt(aspect)
@@ -221,6 +223,12 @@ def _fitted(
         raise BallTruncatedError(
             f"the ball at ({fit.shape[0]:.1f}, {fit.shape[1]:.1f}) shows only {100 * fit.visible:.0f} % of its rim; "
             "at least half is needed"
+        )
+    contrast = abs(fit.level - fit.white)
+    if fit.rim_rms > max(WORST_RIM * contrast, 5.0 * fit.noise_out):
+        raise BallNotFoundError(
+            f"the shape at ({fit.shape[0]:.1f}, {fit.shape[1]:.1f}) is no ball: its rim differs from a blurred circle "
+            f"by {100 * fit.rim_rms / contrast:.0f} % of its contrast"
         )
     sigma = math.sqrt(np.trace(fit.shape_covariance[:2, :2]))
     if not sigma < WORST_SIGMA:

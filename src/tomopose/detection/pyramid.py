@@ -115,7 +115,7 @@ def _peaks(votes, reach, least, most):  # type: ignore[no-untyped-def]
     return out[:size]
 
 
-def circle_centres(level: Array, most: int = 6) -> tuple[float, list[tuple[float, float, float, float, int]]]:
+def circle_centres(level: Array, most: int = 3) -> tuple[float, list[tuple[float, float, float, float, int]]]:
     """Noise of a pixel, and (u, v, low radius, high radius, polarity) of places that edges point to or away from."""
     if min(level.shape) < 9:
         return 0.0, []

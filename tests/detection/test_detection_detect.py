@@ -1,0 +1,165 @@
+"""Whole runs: rows in order, one bad image refused by itself, the same bytes everywhere, resumption."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ball_images import frame, noisy, scene_of
+
+from tomopose import Scanner
+from tomopose.detection import detect, detect_image
+from tomopose.errors import InputError, ShapeError
+from tomopose.observations import BallObservations
+
+N = 256
+
+
+class Stack:
+    """A lazy sequence as readers give it."""
+
+    def __init__(self, images: list[np.ndarray]) -> None:
+        self.images, self.names, self.mask = images, tuple(f"pose_{i}.tif" for i in range(len(images))), None
+        self.pixels_read = 0
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __getitem__(self, i: int) -> np.ndarray:
+        return self.images[i]
+
+    def region(self, i: int, v0: int, v1: int, u0: int, u1: int) -> np.ndarray:
+        self.pixels_read += (v1 - v0) * (u1 - u0)
+        return self.images[i][v0:v1, u0:u1]
+
+
+@pytest.fixture(scope="module")
+def run() -> tuple[Scanner, list[np.ndarray], np.ndarray]:
+    images, truth = [], []
+    rng = np.random.default_rng(8)
+    for u, v in ((90.3, 80.2), (150.7, 90.1), (120.2, 140.9), (160.5, 150.5), (95.1, 150.2), (130.4, 120.3)):
+        scene = scene_of(radius_px=25.0, u=u, v=v, n=N)
+        images.append(noisy(frame(scene), 100, rng, white=30000).round().astype(np.uint16))
+        truth.append(scene.x_D)
+    return scene.scanner, images, np.array(truth)
+
+
+def same(a: BallObservations, b: BallObservations) -> bool:
+    return a.x_D.tobytes() == b.x_D.tobytes() and a.covariance.tobytes() == b.covariance.tobytes() and (
+        a.status == b.status
+    )
+
+
+def test_rows_and_progress(run: tuple[Scanner, list[np.ndarray], np.ndarray]) -> None:
+    scanner, images, truth = run
+    calls: list[tuple[int, int]] = []
+    seen = detect(images, scanner, pose_id=list("abcdef"), progress=lambda d, t: calls.append((d, t)))
+    assert seen.pose_id == tuple("abcdef")
+    assert seen.status == ("ok",) * 6
+    assert np.abs(seen.x_D - truth).max() < 0.02
+    assert calls == [(k, 6) for k in range(1, 7)]
+
+
+def test_the_same_bytes_whatever_does_the_work(run: tuple[Scanner, list[np.ndarray], np.ndarray]) -> None:
+    distributed = pytest.importorskip("distributed")
+    scanner, images, _ = run
+    here = detect(images, scanner)
+    assert same(here, detect((i for i in images), scanner, workers=2))
+    assert same(here, detect(Stack(images), scanner, workers=2))
+    with (
+        distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        assert same(here, detect(Stack(images), scanner, executor=client))
+
+
+def test_predicted_positions_read_regions_only(run: tuple[Scanner, list[np.ndarray], np.ndarray]) -> None:
+    scanner, images, truth = run
+    stack = Stack(images)
+    seen = detect(stack, scanner, predicted=truth + 3.0)
+    assert seen.seen.all()
+    assert stack.pixels_read < 0.75 * 6 * images[0].size
+    assert np.abs(seen.x_D - truth).max() < 0.02
+    astray = detect(stack, scanner, predicted=np.tile([-500.0, 900.0], (6, 1)))
+    assert not astray.seen.any()
+    assert all(s.startswith("not found: the predicted position") for s in astray.status or ())
+
+
+def test_cropped_images(run: tuple[Scanner, list[np.ndarray], np.ndarray]) -> None:
+    scanner, images, truth = run
+    seen = detect([i[20:230, 10:240] for i in images], scanner, origin=(10, 20))
+    assert np.abs(seen.x_D - truth).max() < 0.02
+
+
+def test_one_bad_image_is_one_bad_row(run: tuple[Scanner, list[np.ndarray], np.ndarray]) -> None:
+    scanner, images, _ = run
+    colour = np.stack([images[0]] * 3, axis=-1)
+    bad = [images[0], colour, images[1], images[2][:100], np.zeros_like(images[0]), images[3],
+           images[0].astype(complex), images[4]]  # fmt: skip
+    seen = detect(bad, scanner)
+    assert seen.seen.tolist() == [True, False, True, False, False, True, False, True]
+    assert np.isnan(seen.x_D[1]).all()
+    reasons = np.array(seen.status)[~seen.seen]
+    assert [r.split(":")[0] for r in reasons] == ["bad image", "bad image", "not found", "bad image"]
+    assert "colour" in reasons[0]
+    assert "origin=(u, v)" in reasons[1]
+    assert "complex" in reasons[3]
+
+
+def test_a_fault_of_all_images_is_an_error(run: tuple[Scanner, list[np.ndarray], np.ndarray]) -> None:
+    scanner, images, _ = run
+    half = [i[: N - 24 : 2, ::2][: scanner.n_v // 2, : scanner.n_u // 2] for i in images]
+    with pytest.raises(ShapeError, match=r"scanner.binned\(2\)"):
+        detect(half, scanner)
+    with pytest.raises(ShapeError, match="at least 16"):
+        detect([i[:9, :9] for i in images], scanner, origin=(5, 5))
+    with pytest.raises(InputError, match="6 images but 2 pose ids"):
+        detect(images, scanner, pose_id=[1, 2])
+    with pytest.raises(InputError, match="ball_diameter"):
+        detect(images, scanner, ball_diameter=-1.0)
+    with pytest.raises(ShapeError, match="beyond the detector"):
+        detect_image(images[0], scanner, origin=(40, 40))
+
+
+def test_lag_of_the_previous_pose(run: tuple[Scanner, list[np.ndarray], np.ndarray]) -> None:
+    scanner, images, _ = run
+    ghost = 0.03 * (images[0].astype(float) - 30000.0)
+    lagging = [images[0], np.clip(images[3] + ghost, 0, 65535).astype(np.uint16)]
+    status = detect(lagging, scanner).status or ()
+    assert status[0] == "ok"
+    assert status[1].startswith("lag")
+    assert float(status[1].split()[1]) == pytest.approx(3.0, abs=0.8)
+
+
+def test_a_shape_of_another_size_is_not_the_ball(run: tuple[Scanner, list[np.ndarray], np.ndarray]) -> None:
+    scanner, images, _ = run
+    other = scene_of(radius_px=25.0, u=120.0, v=110.0, n=N, radius=4.0 * 0.5, mu_tube=0.0)
+    screw = noisy(frame(other), 100, np.random.default_rng(2), white=30000).round().astype(np.uint16)
+    seen = detect([*images, screw], scanner)
+    assert seen.seen.tolist() == [True] * 6 + [False]
+    assert "the ball in the other images" in (seen.status or ())[6]
+
+
+def test_an_interrupted_run_goes_on_from_its_journal(
+    run: tuple[Scanner, list[np.ndarray], np.ndarray], tmp_path: Path
+) -> None:
+    scanner, images, _ = run
+    journal = tmp_path / "new" / "detect.jsonl"
+
+    def broken() -> Iterator[np.ndarray]:
+        yield from images[:3]
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        detect(broken(), scanner, journal=journal)
+    assert len(journal.read_text().splitlines()) == 3
+    with open(journal, "a") as stream:
+        stream.write('{"name": "3", "key": "cut sho')
+    marked = journal.read_text().replace('"flags": []', '"flags": ["few photons"]', 1)
+    journal.write_text(marked)
+    changed = [images[0], images[5], *images[2:]]
+    seen = detect(changed, scanner, journal=journal)
+    assert (seen.status or ())[:2] == ("few photons", "ok")
+    assert same(seen.select(range(1, 6)), detect(changed, scanner).select(range(1, 6)))
