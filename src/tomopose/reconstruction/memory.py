@@ -57,6 +57,26 @@ def padded_bytes(grid: VoxelGrid, layers: int | None = None) -> int:
     return 4 * ((layers or n_z) + MARGIN) * (n_y + MARGIN) * (n_x + MARGIN)
 
 
+def memory_limit(memory_gib: float | None) -> float | None:
+    """Bytes to keep within: what was asked for, else what the system reports as free, else None."""
+    if memory_gib is None:
+        return available_bytes()
+    if not memory_gib > 0:
+        raise InputError(f"memory_gib is {memory_gib!r}; a positive number is needed")
+    return memory_gib * GIB
+
+
+def require_room_for_cgls(matrices: ProjectionMatrices, grid: VoxelGrid, *, memory_gib: float | None) -> None:
+    """InputError where three volumes and three scans do not fit: CGLS holds both whole."""
+    limit = memory_limit(memory_gib)
+    needed = BASE + 3 * padded_bytes(grid) + 3 * 4 * len(matrices) * matrices.n_u * matrices.n_v
+    if limit is not None and needed > limit:
+        raise InputError(
+            f"too little memory: CGLS needs {needed / GIB:.2f} GiB, {limit / GIB:.2f} GiB are there; SART streams its "
+            "images and can work in slabs"
+        )
+
+
 def memory_plan(
     matrices: ProjectionMatrices, grid: VoxelGrid, *, subset_size: int, passes: float, memory_gib: float | None,
     most_voxels: int, may_cut: bool, support: bool = False,
@@ -67,13 +87,7 @@ def memory_plan(
     the limit.  Raises InputError, saying what would fit, where one piece does not and `may_cut` (a scratch folder) is
     missing, or where not even one layer does.
     """
-    limit: float | None
-    if memory_gib is not None:
-        if not memory_gib > 0:
-            raise InputError(f"memory_gib is {memory_gib!r}; a positive number is needed")
-        limit = memory_gib * GIB
-    else:
-        limit = available_bytes()
+    limit = memory_limit(memory_gib)
     n = len(matrices)
     samples = 4 * n * (matrices.n_u * matrices.n_v) // sampling_stride(matrices) ** 2
     images = IMAGE_COPIES * 4 * subset_size * matrices.n_u * matrices.n_v + samples

@@ -27,7 +27,7 @@ from tomopose.reconstruction.line_integrals import (
     require_contrast,
     ring_offset,
 )
-from tomopose.reconstruction.memory import memory_plan, sampling_stride
+from tomopose.reconstruction.memory import memory_plan, require_room_for_cgls, sampling_stride
 from tomopose.reconstruction.order import subsets, view_order
 from tomopose.reconstruction.path import SourcePath, source_path
 from tomopose.reconstruction.updates import Samples, cgls, fdk_update, run, sart_update, view_residuals
@@ -150,6 +150,7 @@ def reconstruct(
     options = dict(engine_options or {})
     stride = sampling_stride(matrices)
     if algorithm == "cgls":
+        require_room_for_cgls(matrices, grid, memory_gib=memory_gib)
         values, residual = solve_cgls(name, scan, grid, support, options, int(sweeps), progress)
     else:
         field = open_field(
