@@ -102,13 +102,15 @@ def apex_angle(feature: Feature) -> Measured:
     return _propagated(lambda a: 2.0 * float(a[7]), (feature,), "rad", "unidirectional", "least squares")
 
 
-def form(feature: Feature, which: Literal["form", "form_95", "form_25"]) -> Measured:
+def form(feature: Feature, which: str) -> Measured:
     """Form deviation, mm: range of all used points, narrowest shell of 95 % of them, or range of 25 patch means.
 
     Its uncertainty is not determinable from one surface: noise adds to it on one side only.
     """
     words = {"form": f"range of {feature.n_used} points", "form_95": f"95 % of {feature.n_used} points",
              "form_25": "range of 25 patch means"}
+    if which not in words:
+        raise InputError(f"{which!r} is no form deviation; {', '.join(words)} are known")
     return Measured(value=float(getattr(feature, which)), u=np.nan, dof=np.nan, unit="mm", direction="bidirectional",
                     method=f"{words[which]} about the least-squares {feature.kind}; outliers: {feature.outlier_rule}")
 
@@ -125,8 +127,10 @@ def position(feature: Feature, nominal: Any) -> Measured:
     )
 
 
-def coordinate(feature: Feature, axis: Literal["x", "y", "z"]) -> Measured:
-    """A coordinate of the feature's point, mm."""
+def coordinate(feature: Feature, axis: str) -> Measured:
+    """Coordinate x, y or z of the feature's point, mm, in W."""
+    if axis not in ("x", "y", "z"):
+        raise InputError(f"{axis!r} is no coordinate; x, y or z is needed")
     k = "xyz".index(axis)
     return _propagated(lambda a: float(a[k]), (feature,), "mm", "unidirectional", f"coordinate {axis}")
 

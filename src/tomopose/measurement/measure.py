@@ -246,12 +246,10 @@ def _row(
             found = m.apex_angle(one)
         elif p.kind == "position":
             found = m.position(one, alignment.points(p.nominal_point))
-        elif p.kind == "form" or p.kind == "form_95" or p.kind == "form_25":
+        elif p.kind in ("form", "form_95", "form_25"):
             found = m.form(one, p.kind)
-        elif p.kind == "x" or p.kind == "y" or p.kind == "z":
-            found = m.coordinate(one, p.kind)
         else:
-            raise InputError(f"kind {p.kind!r} is not known")
+            found = m.coordinate(one, p.kind)
     except InputError as error:
         raise InputError(f"measurand {p.name!r}: {error}") from error
     if p.kind in m.UNITS:
