@@ -92,7 +92,8 @@ def vtp(comparison: Comparison) -> str:
     deviation = (comparison.deviation * MICROMETRES_PER_MM).astype("<f8")
     return (
         '<?xml version="1.0"?>\n<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" '
-        f'header_type="UInt64">\n<PolyData><Piece NumberOfPoints="{n}" NumberOfPolys="{m}">\n<PointData Scalars="deviation_um">'
+        f'header_type="UInt64">\n<PolyData><Piece NumberOfPoints="{n}" NumberOfPolys="{m}">\n'
+        '<PointData Scalars="deviation_um">'
         f'<DataArray type="Float64" Name="deviation_um" format="binary">{block(deviation)}</DataArray></PointData>\n'
         '<Points><DataArray type="Float64" NumberOfComponents="3" format="binary">'
         f'{block(np.ascontiguousarray(comparison.points, dtype="<f8"))}</DataArray></Points>\n'
