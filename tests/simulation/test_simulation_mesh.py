@@ -1,4 +1,4 @@
-"""Meshes: paths against the analytic ball, parity at shared edges, the specimen, and the image against the analytic one."""
+"""Meshes: paths against the analytic ball, parity at shared edges, the specimen, and images of meshes."""
 
 from __future__ import annotations
 

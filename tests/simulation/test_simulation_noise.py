@@ -40,7 +40,10 @@ def test_pixels_are_independent_and_frames_differ():
 
 def test_bands_do_not_change_a_byte():
     T = np.random.default_rng(0).random((257, 301))
-    for detector in (Detector(), Detector(readout_noise=3.0, dark=100.0, gain_spread=0.01, noise_sigma=0.8, falloff=True)):
+    for detector in (
+        Detector(),
+        Detector(readout_noise=3.0, dark=100.0, gain_spread=0.01, noise_sigma=0.8, falloff=True),
+    ):
         one = expose(T, detector, PANEL, seed=5, frame=2)
         assert (one == expose(T, detector, PANEL, seed=5, frame=2, threads=3)).all()
         assert (one != expose(T, detector, PANEL, seed=6, frame=2)).any()
@@ -102,7 +105,7 @@ def test_saturation_depth_and_dead_pixels():
 
 
 @pytest.mark.parametrize(
-    "values", [{"snr": 0.0}, {"snr": math.nan}, {"photons": -1.0}, {"blur_sigma": -0.1}, {"white": 70000.0}, {"bits": 17},
+    "values", [{"snr": 0.0}, {"snr": math.nan}, {"photons": -1.0}, {"blur_sigma": -0.1}, {"white": 7e4}, {"bits": 17},
                {"lag": (0.6, 0.5)}, {"dead_share": 0.7}, {"output": "log"}, {"averages": 0}, {"cells": 40}],
 )
 def test_impossible_detectors_are_refused(values):

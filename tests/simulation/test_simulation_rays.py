@@ -63,7 +63,7 @@ def test_sphere_at_grazing_incidence_to_a_nanometre():
     getcontext().prec = 50
     r, z = 4.0, 283.5
     for b in (0.0, 1.0, 3.9, 3.999, 3.9999999, 3.999999999):
-        # A ray that leaves the origin and passes the centre (0, 0, z) at distance b has the direction (b, 0, sqrt(z^2-b^2)).
+        # A ray from the origin that passes (0, 0, z) at distance b has the direction (b, 0, sqrt(z^2-b^2)).
         d = np.array([b, 0.0, np.sqrt(z * z - b * b)])
         d /= np.linalg.norm(d)
         x, y = Decimal(float(d[0])), Decimal(float(d[2]))

@@ -6,6 +6,7 @@ projector's rays.  How it starts without a screen is told in docs/concepts/virtu
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,9 +37,11 @@ def _engine() -> Any:
             'engine = "gvxr" needs gvxr, which is not installed', install_line="pip install gvxr"
         ) from error
     try:
+        # It tells its start-up story to the terminal unless it is given another place.
+        gvxr.useLogFile(os.devnull)
         gvxr.createWindow(-1, 0, "EGL")
         gvxr.usePointSource()
-        gvxr.setMonoChromatic(0.08, "MeV", 1)
+        gvxr.setMonoChromaticPerPixelAtSDD(0.08, "MeV", 1)
     except Exception as error:
         raise EngineFailedError(
             f"gvxr opens no EGL context ({error}); on Debian it needs libegl1, libegl-mesa0 and libgl1-mesa-dri"

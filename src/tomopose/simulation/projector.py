@@ -27,12 +27,12 @@ from tomopose.simulation.rays import LARGEST, Compiled, trace
 from tomopose.simulation.spectrum import Beam
 from tomopose.units import Array
 
-LATTICES = ((5, 3), (13, 8), (21, 13))
+LATTICES = ((5, 3), (13, 8))
 """Fibonacci lattices (n, k) of a cell: points (i / n, k i / n mod 1), placed symmetrically about its middle."""
 FLAT = 2e-3
-"""Differences of transmission over a cell below this need no lattice; above 4, 16 times as much a finer one; above
-32 times an edge is cut exactly."""
-LINES, HALVINGS = 6, 9
+"""Differences of transmission over a cell below this need no lattice; above 6 times this the finer one; above 24 times
+an edge is cut exactly."""
+HALVINGS = 9
 GAUSS = np.stack([(np.polynomial.legendre.leggauss(4)[0] + 1) / 2, np.polynomial.legendre.leggauss(4)[1] / 2], axis=1)
 OPAQUE = 30.0
 """exp(-30) = 1e-13: nothing gets through."""
@@ -170,38 +170,56 @@ def _add(out: Any, row: int, column: int, m: float, m_u: float, m_v: float, m_uv
 
 
 @njit(cache=True, nogil=True)
-def _split_cell(c: Any, work: Any, left: float, low: float, h: float, along_u: bool) -> Any:
+def _crossing(c: Any, work: Any, u_0: float, v_0: float, u_1: float, v_1: float, mark: int) -> float:
+    """Where between two points (0 to 1) the surfaces seen change from those of signature `mark`, by halving."""
+    lo, hi = 0.0, 1.0
+    for _ in range(HALVINGS):
+        x = 0.5 * (lo + hi)
+        _, here = _at(c, work, u_0 + x * (u_1 - u_0), v_0 + x * (v_1 - v_0))
+        if here == mark:
+            lo = x
+        else:
+            hi = x
+    return 0.5 * (lo + hi)
+
+
+@njit(cache=True, nogil=True)
+def _split_cell(
+    c: Any, work: Any, left: float, low: float, h: float, along_u: bool, m_00: int, m_10: int, m_01: int, m_11: int
+) -> Any:
     """Moments (m, m_u, m_v, m_uv about the middle, side 1) of a cell that a steep edge crosses.
 
-    On each of LINES lines across the edge its place is found by halving, and both sides are integrated by Gauss's
-    rule in the root of the distance from the edge, where the transmission behind a round rim is smooth.
+    x runs across the edge (along u or v), y along it; m_xy: signatures of the corners.  The cell is cut at the y where
+    the edge leaves it sideways, if it does; on Gauss's lines in y the edge's place is found by halving, and both sides
+    are integrated by Gauss's rule in the root of the distance from the edge, where a round rim is smooth.
     """
     m = m_u = m_v = m_uv = 0.0
-    for q in range(LINES):
-        y = (q + 0.5) / LINES
-        lo, hi = 0.0, 1.0
-        _, mark_lo = _at(c, work, left + (0.0 if along_u else y) * h, low + (y if along_u else 0.0) * h)
-        _, mark_hi = _at(c, work, left + (1.0 if along_u else y) * h, low + (y if along_u else 1.0) * h)
-        if mark_lo != mark_hi:
-            for _ in range(HALVINGS):
-                x = 0.5 * (lo + hi)
-                _, mark = _at(c, work, left + (x if along_u else y) * h, low + (y if along_u else x) * h)
-                if mark == mark_lo:
-                    lo = x
-                else:
-                    hi = x
-        edge = 0.5 * (lo + hi)
-        for side in range(2):
-            length = -edge if side == 0 else 1.0 - edge
-            for g in range(len(GAUSS)):
-                x = edge + length * GAUSS[g, 0] ** 2
-                value, _ = _at(c, work, left + (x if along_u else y) * h, low + (y if along_u else x) * h)
-                value *= 2 * GAUSS[g, 0] * GAUSS[g, 1] * abs(length) / LINES
-                a, b = (x - 0.5, y - 0.5) if along_u else (y - 0.5, x - 0.5)
-                m += value
-                m_u += value * a
-                m_v += value * b
-                m_uv += value * a * b
+    u_x, v_x, u_y, v_y = (h, 0.0, 0.0, h) if along_u else (0.0, h, h, 0.0)
+    cut = 1.0
+    if (m_00 != m_10) != (m_01 != m_11):
+        if m_00 != m_01:
+            cut = _crossing(c, work, left, low, left + u_y, low + v_y, m_00)
+        else:
+            cut = _crossing(c, work, left + u_x, low + v_x, left + u_x + u_y, low + v_x + v_y, m_10)
+    for part in range(1 if cut == 1.0 else 2):
+        y_0, y_1 = (0.0, cut) if part == 0 else (cut, 1.0)
+        for q in range(len(GAUSS)):
+            y = y_0 + (y_1 - y_0) * GAUSS[q, 0]
+            u, v = left + y * u_y, low + y * v_y
+            _, mark = _at(c, work, u, v)
+            _, other = _at(c, work, u + u_x, v + v_x)
+            edge = _crossing(c, work, u, v, u + u_x, v + v_x, mark) if mark != other else 0.5
+            for side in range(2):
+                length = -edge if side == 0 else 1.0 - edge
+                for g in range(len(GAUSS)):
+                    x = edge + length * GAUSS[g, 0] ** 2
+                    value, _ = _at(c, work, u + x * u_x, v + x * v_x)
+                    value *= 2 * GAUSS[g, 0] * GAUSS[g, 1] * abs(length) * GAUSS[q, 1] * (y_1 - y_0)
+                    a, b = (x - 0.5, y - 0.5) if along_u else (y - 0.5, x - 0.5)
+                    m += value
+                    m_u += value * a
+                    m_v += value * b
+                    m_uv += value * a * b
     return m, m_u, m_v, m_uv
 
 
@@ -300,14 +318,26 @@ def _cells(
                             weight * f * f * (f_11 - f_10 - f_01 + f_00),
                         )
                         continue
-                    if not same and span > 32 * FLAT:
-                        across = abs(f_01 + f_11 - f_00 - f_10) > abs(f_10 + f_11 - f_00 - f_01)
-                        m, m_u, m_v, m_uv = _split_cell(c, work, left + b * h, low + a * h, h, across)
+                    if not same and span > 24 * FLAT:
+                        m_00, m_01 = node_seen[a, b], node_seen[a, b + 1]
+                        m_10, m_11 = node_seen[a + 1, b], node_seen[a + 1, b + 1]
+                        sides_u = int(m_00 != m_01) + int(m_10 != m_11)
+                        sides_v = int(m_00 != m_10) + int(m_01 != m_11)
+                        along_u = abs(f_01 + f_11 - f_00 - f_10) > abs(f_10 + f_11 - f_00 - f_01)
+                        if sides_u != sides_v:
+                            along_u = sides_u > sides_v
+                        if along_u:
+                            m, m_u, m_v, m_uv = _split_cell(
+                                c, work, left + b * h, low + a * h, h, True, m_00, m_01, m_10, m_11
+                            )
+                        else:
+                            m, m_u, m_v, m_uv = _split_cell(
+                                c, work, left + b * h, low + a * h, h, False, m_00, m_10, m_01, m_11
+                            )
                         k = weight * 12 * f
                         _add(out, j * f + a, i * f + b, weight * m, k * m_u, k * m_v, k * 12 * f * m_uv)
                         continue
-                    which = 2 if span > 16 * FLAT else (1 if span > 4 * FLAT else 0)
-                    n, step = LATTICES[which]
+                    n, step = LATTICES[1] if span > 6 * FLAT else LATTICES[0]
                     m = m_u = m_v = m_uv = 0.0
                     for q in range(n):
                         x, y = (q + 0.5) / n, (((q - n // 2) * step + n // 2) % n + 0.5) / n

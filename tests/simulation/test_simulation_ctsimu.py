@@ -1,0 +1,66 @@
+"""A run written as a CTSimU scenario and read back images the same; what cannot be read is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tomopose import PoseSequence, RigidTransform, Scanner
+from tomopose.errors import InputError
+from tomopose.geometry.frames import Frame
+from tomopose.simulation.ctsimu import run_from_ctsimu, run_to_ctsimu
+from tomopose.simulation.mesh import write_stl
+from tomopose.simulation.run import simulate_ball_run, transmission
+from tomopose.simulation.shapes import Solid, box, cylinder
+from tomopose.simulation.spot import FocalSpot
+
+pytest.importorskip("embreex")
+pytest.importorskip("manifold3d")
+pytest.importorskip("trimesh")
+
+
+@pytest.fixture
+def run():
+    scanner = Scanner(d_SD=800.0, d_SR=200.0, p_u=0.8, p_v=0.9, u_0=31.3, v_0=28.7, n_u=61, n_v=57)
+    mount = RigidTransform.from_angles([0.02, 0.03, 3.1], [0.5, -0.4, 0.3], source=Frame.H, target=Frame.T)
+    poses = PoseSequence.from_table([[0, 0, 0], [1, 2, -1]], [[0, 0, 0], [5, -3, 2]], alpha=np.array([0.0, 0.7]))
+    solids = (Solid(shape=(box(6, 4, 5) - cylinder(1, -5, 5)).placed(t=[0.5, 1.0, -1.0]), material="Al"),)
+    made = simulate_ball_run(scanner, T_HT=mount, t=np.zeros(3), poses=poses, solids=solids, copper=0.0)
+    return replace(made, t=None, ball_diameter=None, spot=FocalSpot(shape="gaussian", size_u=0.05, size_v=0.05))
+
+
+def test_there_and_back(run, tmp_path):
+    content, files = run_to_ctsimu(run)
+    for name, mesh in files.items():
+        write_stl(tmp_path / name, mesh)
+    content = json.loads(json.dumps(content))
+    back = run_from_ctsimu(content, folder=tmp_path)
+    assert back.scanner.d_SD == pytest.approx(800.0)
+    assert back.detector.blur_sigma == pytest.approx(run.detector.blur_sigma)
+    assert back.spot.size_u == pytest.approx(0.05)
+    # A scenario without scintillator counts all energy: compare with the run's own spectrum.
+    back = replace(back, spectrum=run.spectrum)
+    for i in range(2):
+        a, b = transmission(run, i), transmission(back, i)
+        assert a.min() < 0.85
+        np.testing.assert_allclose(a, b, atol=4e-3)
+
+
+def test_the_scenario_is_of_the_format_and_names_its_materials(run):
+    content, files = run_to_ctsimu(run)
+    assert content["file"]["file_format_version"] == {"major": 1, "minor": 2}
+    assert [m["id"] for m in content["materials"]] == [s["material_id"] for s in content["samples"]] == ["Al"]
+    assert list(files) == [content["samples"][0]["file"]]
+
+
+def test_what_is_not_read_is_refused(run, tmp_path):
+    content, _ = run_to_ctsimu(run)
+    with pytest.raises(InputError, match=r"unsharpness\.mtf"):
+        run_from_ctsimu({**content, "detector": {**content["detector"], "unsharpness": {"mtf": "mtf.tsv"}}})
+    with pytest.raises(InputError, match="voltage"):
+        run_from_ctsimu({**content, "samples": [], "source": {**content["source"], "voltage": None}})
+    with pytest.raises(InputError, match="names no mesh file"):
+        run_from_ctsimu({**content, "samples": [{"name": "x"}]})
