@@ -141,3 +141,17 @@ def test_a_rival_that_fits_better_is_exit_code_3(files, capsys):
     assert json.loads(capsys.readouterr().out)["advice"]
     assert run(files.calibrate(poses=wrong)) == 3
     assert files.json("cal/calibration.json")["verdict"] != "trustworthy"
+
+
+def test_reports_from_what_a_folder_holds(files, capsys):
+    f = files.folder
+    assert run(files.calibrate()) == 0
+    poses = ["--poses", str(f / "poses.csv")]
+    assert run(["report", str(f / "cal"), *poses, "--out", str(f / "again.html"), "--quiet"]) == 0
+    assert "Trustworthy" in (f / "again.html").read_text(encoding="utf-8")
+    (f / "cal" / "calibration.json").unlink()
+    assert run(["report", str(f / "cal"), "--out", str(f / "observations.html"), "--quiet"]) == 0
+    assert "30" in (f / "observations.html").read_text(encoding="utf-8")
+    assert run(["report", str(f / "nowhere"), "--out", str(f / "none.html")]) == 1
+    assert "holds no calibration.json" in capsys.readouterr().err
+    assert not (f / "none.html").exists()
