@@ -1,0 +1,56 @@
+"""The studies by name, and how one is run."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from tomopose.errors import InputError
+from tomopose.provenance import provenance
+from tomopose.studies.result import DEFAULT_SEED, Progress, Scale, StudyResult, require_scale
+from tomopose.studies.steps import Steps
+
+PAPER: Mapping[str, str] = MappingProxyType({"table1": "Table 1, fig. 8 (a)"})
+"""Study -> what of the paper it repeats, in the order in which one reads them; each is a module of this folder."""
+
+
+def run_study(
+    name: str,
+    *,
+    scale: Scale = "small",
+    seed: int = DEFAULT_SEED,
+    folder: str | Path | None = None,
+    progress: Progress | None = None,
+) -> StudyResult:
+    """Run a study: its numbers beside the paper's.
+
+    Parameters
+    ----------
+    name:     a key of PAPER.
+    scale:    "small": minutes at most, same physics, fewer poses; "paper": the paper's full plan.
+    seed:     of all random numbers; the same seed gives the same numbers.
+    folder:   where steps are kept, so that an interrupted run goes on; None keeps none.
+    progress: called with (done, total).
+
+    Raises InputError for an unknown name or scale.
+    """
+    if name not in PAPER:
+        raise InputError(f"unknown study {name!r}; known are {', '.join(PAPER)}")
+    require_scale(scale)
+    module: Any = importlib.import_module(f"tomopose.studies.{name}")
+    steps = Steps(
+        folder=None if folder is None else Path(folder) / "steps",
+        key={"study": name, "scale": scale, "seed": seed},
+    )
+    begin = time.perf_counter()
+    rows, checks, figures, notes = module.run(scale, seed, steps, progress or (lambda done, total: None))
+    return StudyResult(
+        name=name, title=module.TITLE, paper=PAPER[name], question=module.QUESTION, scale=scale, seed=seed,
+        rows=tuple(rows), checks=tuple(checks), figures=tuple(figures), notes=tuple(notes),
+        seconds=time.perf_counter() - begin,
+        provenance=provenance(arguments={"study": name, "scale": scale}, seed=seed),
+    )
