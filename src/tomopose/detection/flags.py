@@ -26,6 +26,8 @@ FLAGS = {
 WHOLE_RIM = 0.985
 LOST = 0.01
 SATURATED, MOSTLY_SATURATED = 0.02, 0.3
+NOISE_FREE = 1e-4
+"""Noise, in contrasts, below which an image counts as computed without noise."""
 FEW = 15.0
 OFF_NOMINAL = 0.2
 MOTION = 0.5
@@ -36,7 +38,8 @@ MOTION_CHI2 = 30.0
 def saturated_share(window: Array, ceiling: float, fit: ConeFit, origin: tuple[int, int]) -> float:
     """Share of the pixels just outside the rim that stand at the image's largest value, where that is a clipped one.
 
-    Counts clip at a power of two less 1; of other values that many alike are clipped too.
+    Counts clip at a power of two less 1; of other values that many alike are clipped too,
+    unless the image is a simulated one without noise.
     """
     v, u = np.mgrid[: window.shape[0], : window.shape[1]]
     distance = np.hypot(u + origin[0] - fit.shape[0], v + origin[1] - fit.shape[1]) - fit.shape[2]
@@ -45,7 +48,8 @@ def saturated_share(window: Array, ceiling: float, fit: ConeFit, origin: tuple[i
         return 0.0
     share = float((ring >= ceiling).mean())
     power_of_two = ceiling >= 255 and float(np.log2(ceiling + 1)).is_integer()
-    return share if power_of_two or share > MOSTLY_SATURATED else 0.0
+    noisy = max(fit.noise_in, fit.noise_out) > NOISE_FREE * abs(fit.level - fit.white)
+    return share if power_of_two or (share > MOSTLY_SATURATED and noisy) else 0.0
 
 
 def expected_radius(scanner: Scanner, ball_diameter: float) -> float:

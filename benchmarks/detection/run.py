@@ -1,0 +1,222 @@
+"""Detection against the Cramer-Rao bound, third-party images, peers and the disk: one command, one table.
+
+    python benchmarks/detection/run.py [--crops 200] [--shared ../shared] [--skip speed,memory]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import tifffile
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "detection"))
+
+from ball_images import cramer_rao, frame, noise_free, noisy, standard_scene, window  # noqa: E402
+
+from tomopose import Scanner  # noqa: E402
+from tomopose.detection import detect, detect_image  # noqa: E402
+
+ROWS: list[tuple[str, str, str]] = []
+
+
+def say(figure: str, measured: str, goal: str = "") -> None:
+    ROWS.append((figure, measured, goal))
+    print(f"{figure:58s} | {measured:44s} | {goal}", flush=True)
+
+
+# Peers: the usual way with each library, on the same crops, ellipse centre corrected to the ball's centre.
+
+
+def canny_ellipse(image: np.ndarray, scanner: Scanner, origin: tuple[int, int]) -> np.ndarray:
+    from skimage.feature import canny
+    from skimage.measure import EllipseModel, ransac
+
+    edges = canny(image / np.percentile(image, 95), sigma=1.0, low_threshold=0.2, high_threshold=0.4)
+    v, u = np.nonzero(edges)
+    points = np.column_stack([u, v]).astype(float)
+    near = np.hypot(*(points - np.median(points, axis=0)).T)
+    points = points[near > 0.5 * np.median(near)]
+    model, _ = ransac(points, EllipseModel, 8, 1.0, max_trials=60, rng=1)
+    xc, yc, a, b, _ = model.params
+    return corrected(np.array([xc, yc]), min(a, b), scanner, origin)
+
+
+def opencv_ellipse(image: np.ndarray, scanner: Scanner, origin: tuple[int, int]) -> np.ndarray:
+    import cv2
+
+    eight = np.clip(255 * image / np.percentile(image, 95), 0, 255).astype(np.uint8)
+    _, dark = cv2.threshold(eight, 128, 255, cv2.THRESH_BINARY_INV)
+    contours, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    (xc, yc), axes, _ = cv2.fitEllipse(max(contours, key=cv2.contourArea))
+    return corrected(np.array([xc, yc]), min(axes) / 2, scanner, origin)
+
+
+def corrected(centre: np.ndarray, semi_minor: float, scanner: Scanner, origin: tuple[int, int]) -> np.ndarray:
+    """m = c / (1 + b^2 / f^2), measured from the piercing point (field of square pixels)."""
+    foot = np.array([scanner.u_0, scanner.v_0])
+    f = scanner.d_SD / scanner.p_u
+    return foot + (centre + origin - foot) / (1 + semi_minor**2 / f**2)
+
+
+def our_centre(image: np.ndarray, scanner: Scanner, origin: tuple[int, int]) -> np.ndarray:
+    return detect_image(image, scanner, origin=origin).x_D
+
+
+def rms(error: np.ndarray) -> float:
+    return float(np.sqrt((error**2).sum(axis=1).mean()))
+
+
+def against_the_bound(crops: int) -> None:
+    for magnification in (2.7, 5.3):
+        rng = np.random.default_rng(round(10 * magnification))
+        scenes = [standard_scene(magnification, du=a, dv=b, blur=s) for (a, b), s in
+                  zip(rng.uniform(-0.5, 0.5, (8, 2)), np.linspace(0.6, 0.8, 8))]  # fmt: skip
+        boxes = [window(s) for s in scenes]
+        clean = [noise_free(s, **b) for s, b in zip(scenes, boxes)]
+        unit = [np.trace(cramer_rao(s, b, 1.0)) for s, b in zip(scenes, boxes)]
+        for snr in (25, 50, 100, 200, 400, 800):
+            error, squares = [], []
+            for k in range(crops):
+                i = k % len(scenes)
+                ball = detect_image(noisy(clean[i], snr, rng, white=30000.0), scenes[i].scanner,
+                                    origin=(boxes[i]["u"], boxes[i]["v"]))  # fmt: skip
+                d = ball.x_D - scenes[i].x_D
+                error.append(d / np.sqrt(unit[i] / snr**2))
+                squares.append(d @ np.linalg.solve(ball.covariance, d) / 2)
+            goal = {50: "1.25", 100: "1.25", 200: "1.25", 400: "1.6"}.get(snr, "")
+            ratio, spread = rms(np.array(error)), np.sqrt(1 / (2 * crops)) / np.sqrt(2)
+            say(f"error / bound, M {magnification}, SNR {snr}, {crops} crops", f"{ratio:.2f} +- {ratio * spread:.2f}", goal)
+            say("  variance of the normalised errors", f"{np.mean(squares):.2f} +- {1 / np.sqrt(crops):.2f}", "0.9 to 1.1")
+
+
+def third_party(shared: Path) -> None:
+    folder = shared / "data" / "ball-radiographs-gvxr"
+    known = json.loads((folder / "scanner.json").read_text())
+    scanner = Scanner(d_SD=known["d_SD_mm"], d_SR=known["d_SR_mm"], p_u=known["p_u_mm"], p_v=known["p_v_mm"],
+                      u_0=known["u_0_px"], v_0=known["v_0_px"], n_u=known["n_u_px"], n_v=known["n_v_px"])  # fmt: skip
+    truth = np.array([[p["u_px"], p["v_px"]] for p in json.loads((folder / "truth.json").read_text())["poses"]])
+    images = [np.ascontiguousarray(tifffile.imread(f)[::-1]) for f in sorted((folder / "radiographs").glob("*.tif"))]
+    ways: dict[str, Callable[..., np.ndarray]] = {
+        "tomopose": our_centre, "scikit-image Canny + EllipseModel": canny_ellipse, "OpenCV fitEllipse": opencv_ellipse,
+    }  # fmt: skip
+    ours = 0.0
+    for name, way in ways.items():
+        way(images[0], scanner, (0, 0))
+        cpu = time.process_time()
+        found = np.array([way(image, scanner, (0, 0)) for image in images])
+        cpu = (time.process_time() - cpu) / len(images)
+        error = rms(found - truth)
+        ours = ours or error
+        times = "" if name == "tomopose" else f", {error / ours:.0f} x ours"
+        say(f"gvxr, 56 images, {name}", f"{error:.5f} px{times}, {1e3 * cpu:.1f} ms CPU",
+            "0.0010 px" if name == "tomopose" else "20 x, slower than ours")  # fmt: skip
+
+
+class Files:
+    """Uncompressed TIFF frames as memory maps: regions are read without the rest."""
+
+    def __init__(self, paths: list[Path]) -> None:
+        self.paths, self.names, self.mask = paths, tuple(p.name for p in paths), None
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, i: int) -> np.ndarray:
+        return tifffile.memmap(self.paths[i], mode="r")
+
+    def region(self, i: int, v0: int, v1: int, u0: int, u1: int) -> np.ndarray:
+        return np.array(self[i][v0:v1, u0:u1])
+
+
+def speed(frames: int) -> None:
+    scene = standard_scene(5.3)
+    clean, rng = frame(scene), np.random.default_rng(1)
+    with tempfile.TemporaryDirectory() as folder:
+        paths = []
+        for k in range(frames):
+            path = Path(folder) / f"frame_{k:03d}.tif"
+            tifffile.imwrite(path, noisy(clean, 200, rng, white=30000.0).round().astype(np.uint16))
+            paths.append(path)
+        files, n = Files(paths), len(paths)
+        cpu = time.process_time()
+        for _ in range(2):
+            for i in range(n):
+                files.region(i, 0, 2048, 0, 2048)
+        read = (time.process_time() - cpu) / (2 * n)
+        detect(files, scene.scanner)
+        cpu = time.process_time()
+        detect(files, scene.scanner)
+        full = (time.process_time() - cpu) / n
+        predicted = np.tile(scene.x_D + 2.0, (n, 1))
+        cpu = time.process_time()
+        detect(files, scene.scanner, predicted=predicted)
+        tracked = (time.process_time() - cpu) / n
+        wall = time.perf_counter()
+        detect(files, scene.scanner, workers=2)
+        wall = (time.perf_counter() - wall) / n
+    say("2048 x 2048 TIFF: read alone", f"{1e3 * read:.1f} ms CPU a frame")
+    say("2048 x 2048 TIFF: read + find + fit", f"{1e3 * full:.1f} ms CPU = {full / read:.1f} x reading; "
+        f"2 cores: {2 / full:.0f} frames/s by CPU time, {1 / wall:.0f} by the clock", "100 frames/s or 2.5 x reading")  # fmt: skip
+    say("  tracked", f"{1e3 * tracked:.1f} ms CPU", "1.3 x the region read")
+
+
+def memory() -> None:
+    """Resident memory of a process that detects in 2,000 frames of 4096 x 4096, made one at a time."""
+    if "--memory-child" not in sys.argv:
+        out = subprocess.run([sys.executable, __file__, "--memory-child"], capture_output=True, text=True, check=True)
+        say("memory, 2,000 frames of 4096 x 4096, peak of the process", out.stdout.strip(), "below 1 GiB")
+        return
+    scanner = Scanner(d_SD=1500.0, d_SR=300.0, p_u=0.1, p_v=0.1, u_0=2047.5, v_0=2047.5, n_u=4096, n_v=4096)
+    v, u = np.mgrid[:4096, :4096].astype(np.float32)
+    image = np.where(np.hypot(u - 2000.4, v - 1900.7) < 200, 300, 30000).astype(np.uint16)
+    image += np.random.default_rng(1).integers(0, 200, image.shape, dtype=np.uint16)
+    del u, v
+    after_setup = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+
+    def frames() -> Iterator[np.ndarray]:
+        for _ in range(2000):
+            yield image.copy()
+
+    predicted = np.tile([2000.4, 1900.7], (2000, 1))
+    seen = detect(frames(), scanner, predicted=predicted, workers=1).seen.sum()
+    detect([image], scanner)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+    print(f"{peak:.0f} MiB ({after_setup:.0f} before the first frame), {seen} seen")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--crops", type=int, default=200, help="simulated crops for each magnification and SNR")
+    parser.add_argument("--frames", type=int, default=24, help="frames of the speed figure")
+    default = os.environ.get("TOMOPOSE_SHARED", Path(__file__).resolve().parents[3] / "shared")
+    parser.add_argument("--shared", type=Path, default=Path(default), help="folder that holds data/")
+    parser.add_argument("--skip", default="", help="bound,gvxr,speed,memory: those to leave out")
+    parser.add_argument("--memory-child", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.memory_child:
+        memory()
+        return
+    print(f"{'figure':58s} | {'measured':44s} | goal")
+    skip = options.skip.split(",")
+    if "gvxr" not in skip:
+        third_party(options.shared)
+    if "speed" not in skip:
+        speed(options.frames)
+    if "bound" not in skip:
+        against_the_bound(options.crops)
+    if "memory" not in skip:
+        memory()
+
+
+if __name__ == "__main__":
+    main()
