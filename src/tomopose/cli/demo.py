@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -40,7 +41,7 @@ def demo(
     from tomopose.files import require_absent
     from tomopose.geometry.rotations import rotation_angle_between
     from tomopose.provenance import provenance
-    from tomopose.studies.demo import demo_setup
+    from tomopose.studies.demo import demo_setup, rehearse
 
     say = Say(json=as_json, quiet=quiet)
     for name in ("calibration.json", "scan.csv", "matrices.npz", "scanner.json"):
@@ -50,8 +51,10 @@ def demo(
         setup.scanner, T_HT=setup.T_HT, t=setup.t, poses=setup.poses, ball_diameter=setup.ball_diameter,
         snr=setup.snr, seed=setup.seed,
     )
-    with say.progress("simulating") as progress:
+    with say.progress("simulating") as progress, ThreadPoolExecutor(max_workers=1) as beside:
+        rehearsal = beside.submit(rehearse, setup)
         write_run(out, run, workers=workers, force=force, progress=progress)
+        rehearsal.result()
 
     # From here on as with one's own data: only what the files say is used.
     scanner, poses = tp.read_scanner(out / "scanner.json"), tp.read_poses(out / "poses.csv")
