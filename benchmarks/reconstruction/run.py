@@ -144,14 +144,16 @@ def accuracy(views: int = 360, n: int = 256) -> Result:
         found = compare(volume.values, grid, objects)
         result[name] = {
             "centre_mean": float(found.centre_error.mean()), "centre_max": float(found.centre_error.max()),
+            "centroid_mean": float(found.centroid_error.mean()),
             "radius_mean": float(found.radius_error.mean()), "radius_sd": float(found.radius_error.std()),
             "inner": float(found.inner.mean()), "background": found.background, "cpu_s": clock.cpu,
             "view_residual": float(volume.view_residual.mean()),
         }
         print(
-            f"{name:12s} centre {found.centre_error.mean():.4f} mean {found.centre_error.max():.4f} max voxel, radius "
-            f"{found.radius_error.mean():+.4f} +- {found.radius_error.std():.4f}, inner {found.inner.mean():.4f}, "
-            f"background {found.background:.4f}, {clock.cpu:.0f} cpu s", flush=True
+            f"{name:12s} centre of fit {found.centre_error.mean():.4f} mean {found.centre_error.max():.4f} max, of "
+            f"mass {found.centroid_error.mean():.4f} voxel, radius {found.radius_error.mean():+.4f} +- "
+            f"{found.radius_error.std():.4f}, inner {found.inner.mean():.4f}, background {found.background:.4f}, "
+            f"{clock.cpu:.0f} cpu s", flush=True
         )
     return result
 

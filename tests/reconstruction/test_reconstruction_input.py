@@ -105,7 +105,7 @@ def test_volumes_out_of_view_are_refused():
 def test_too_little_memory_says_what_would_fit():
     with pytest.raises(InputError, match=r"GiB are needed for 400 x 400 x 400 voxels.*\^3 voxels would fit.*scratch"):
         attempt(grid=VoxelGrid.cube(n=400, spacing=0.015), memory_gib=0.5)
-    with pytest.raises(InputError, match="CGLS needs 0.3"):
+    with pytest.raises(InputError, match=r"CGLS needs 0\.3"):
         attempt(memory_gib=0.3, algorithm="cgls")
     with pytest.raises(InputError, match="too little memory: one layer"):
         attempt(memory_gib=0.1)
