@@ -55,9 +55,6 @@ class FreeParameters:
         """(f,) 1 / sigma^2."""
         return np.where(np.isfinite(self.sigma), 1.0 / np.asarray(self.sigma) ** 2, 0.0)
 
-    def without_priors(self) -> FreeParameters:
-        return replace(self, sigma=np.full(len(self), np.inf))
-
 
 def base_name(name: str) -> str:
     """The parameter's name without its run."""

@@ -220,7 +220,10 @@ def calibrate(
         other = set_pose_rival(problem, poses)
         quick = [r for r in (*RIVALS, *([other] if other else [])) if r.quick]
         diagnosis = ranked(stated.used, freed, stated.fit, quick, starts=0)
-    arguments = {"model": model, "free": list(free), "fix": list(fix), "priors": dict(priors or {}), "robust": robust}
+    arguments = {
+        "model": model, "free": list(free), "fix": list(fix), "priors": dict(priors or {}), "robust": robust,
+        "pose_noise": pose_noise if pose_noise is None or isinstance(pose_noise, str) else list(pose_noise),
+    }
     rigid = _calibration(solution, stated, diagnosis, arguments)
     if not rigid.converged and raise_on_failure:
         raise NotConvergedError(rigid.status, calibration=rigid)
