@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib.metadata
 import platform
@@ -55,6 +56,7 @@ class Provenance:
         )
 
 
+@functools.cache
 def package_version(name: str = "tomopose") -> str:
     """Installed version of a package, or "not installed"."""
     try:
