@@ -169,7 +169,7 @@ def agreement(n: int = 256, views: int = 30) -> Result:
     ).values
     engine = RtkEngine(matrices, grid)
     state = engine.empty()
-    for j in view_order(views):
+    for j in view_order(views, PAPER["order"]):
         state = rtk_sart(engine, images[j : j + 1], [int(j)], state)
     peer = engine.values(state)
     span = float(np.ptp(peer))

@@ -52,7 +52,7 @@ def test_ball_centres_on_a_tilted_path(tilted, settings):
 
 def test_order_decides(tilted):
     spread, _ = truth_of(tilted[1], tilted[0], **PAPER)
-    in_turn, _ = truth_of(tilted[1], tilted[0], **PAPER, order="sequential")
+    in_turn, _ = truth_of(tilted[1], tilted[0], **{**PAPER, "order": "sequential"})
     assert np.abs(in_turn.inner - 1).mean() > 3 * np.abs(spread.inner - 1).mean()
 
 
