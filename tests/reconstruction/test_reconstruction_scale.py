@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 from reconstruction_phantom import balls, images_of, scan
@@ -9,6 +11,7 @@ from reconstruction_phantom import balls, images_of, scan
 from tomopose.engines.storage import mapped
 from tomopose.errors import InputError
 from tomopose.reconstruction import reconstruct
+from tomopose.reconstruction.field import Piece
 from tomopose.reconstruction.memory import GIB, memory_plan, padded_bytes
 from tomopose.volume import VoxelGrid
 
@@ -103,6 +106,15 @@ def test_progress_counts_all_updates():
     seen = []
     run(progress=lambda done, total: seen.append((done, total)), subset_size=5, iterations=2)
     assert seen == [(k, 24) for k in range(1, 25)]  # 8 for the start by fives, 8 a sweep
+
+
+def test_what_travels_to_a_cluster_survives_the_journey():
+    piece = pickle.loads(pickle.dumps(Piece("cpu", MATRICES, GRID.slab(3, 20), None, {"threads": 1})))
+    views = [0, 7]
+    piece.back(IMAGES[views], views, weight="sum", scale=1.0, nonnegative=False)
+    here = Piece("cpu", MATRICES, GRID.slab(3, 20), None, {"threads": 2})
+    here.back(IMAGES[views], views, weight="sum", scale=1.0, nonnegative=False)
+    assert np.array_equal(piece.values(), here.values())
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
