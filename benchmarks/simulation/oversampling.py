@@ -17,7 +17,7 @@ from tomopose.simulation.run import SimulatedRun
 
 
 def ball_image(run: SimulatedRun, i: int, window: tuple[int, int, int, int], *, n: int = 96, sigma: float) -> Any:
-    """Transmission of the ball alone on pixels (u_0, v_0, n_u, n_v): n x n points a pixel, then Gaussian and pixel box."""
+    """Transmission of the ball alone on pixels (u_0, v_0, n_u, n_v): n x n points a pixel, then blur and pixel box."""
     view, T_MW = View.of(run.scanner), run.frames(i)[Frame.M]
     c = T_MW.apply(run.t) - view.source
     r = run.ball_diameter / 2

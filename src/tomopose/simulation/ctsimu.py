@@ -1,7 +1,8 @@
 """CTSimU scenarios (format 1.0 to 1.2) as runs of the virtual scanner, and runs as scenarios, as far as both go.
 
-Read: geometry of every frame, voltage, filters, windows, spot, scintillator, grey values, SNR, unsharpness, lag, mesh samples on the stage, materials with a formula or mass fractions.  What else a scenario asks for is
-named in `NOT_READ` and refused, never passed over.
+Read: geometry of every frame, voltage, filters, windows, spot, scintillator, grey values, SNR, unsharpness, lag,
+mesh samples on the stage, materials with a formula or mass fractions.  What else a scenario asks for is named in
+`NOT_READ` and refused, never passed over.
 """
 
 from __future__ import annotations
@@ -220,8 +221,8 @@ def _detector(content: Mapping[str, Any], scanner: Scanner) -> Detector:
 def run_to_ctsimu(run: SimulatedRun) -> tuple[dict[str, Any], dict[str, Mesh]]:
     """(scenario content, mesh files by name): geometry by the true poses, meshes in M, tessellated where analytic.
 
-    The spectrum's voltage is its highest energy; filters are not kept apart from the tube in a run, so that the scenario
-    names none: a reader who needs them finds them in the scene.
+    The voltage is the spectrum's highest energy; a run does not keep filters apart from the tube, so that the
+    scenario names none: a reader who needs them finds them in the scene.
     """
     home = eq5_matrices(run.scanner, T_HT=run.T_HT, T_MH=run.T_MH, alpha=np.asarray(run.poses.alpha))
     matrices = ProjectionMatrices(

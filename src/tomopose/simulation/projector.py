@@ -34,6 +34,12 @@ FLAT = 2e-3
 an edge is cut exactly."""
 HALVINGS = 9
 GAUSS = np.stack([(np.polynomial.legendre.leggauss(4)[0] + 1) / 2, np.polynomial.legendre.leggauss(4)[1] / 2], axis=1)
+BLOCK = 4
+"""Between every fourth corner rays are interpolated where all around sees the same, smoothly."""
+EVEN = 5e-4
+"""Largest third difference of transmission over coarse corners that counts as smooth."""
+SMALL_PX = 8.0
+"""Where a primitive is thinner than this (half its side, px), every ray is cast."""
 OPAQUE = 30.0
 """exp(-30) = 1e-13: nothing gets through."""
 STEPS = 128
@@ -127,13 +133,87 @@ def _at(c: Any, work: Any, u: float, v: float) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _corners(c: Any, depth: int, u_0: int, v_0: int, mask: Any, j_0: int, j_1: int, I: Any, seen: Any) -> bool:
+def _coarse(c: Any, depth: int, u_0: int, v_0: int, mask: Any, j_0: int, j_1: int, I: Any, seen: Any) -> None:
+    """Every BLOCK-th corner, rows j_0 to j_1 of them; seen is 0 where nothing is met, or less than may be met."""
     work = _work_space(c, depth)
-    fine = True
     for j in range(j_0, j_1):
         for i in range(I.shape[1]):
             I[j, i], seen[j, i] = 1.0, 0
-            if mask[j, i]:
+            if mask[BLOCK * j, BLOCK * i]:
+                I[j, i], seen[j, i] = _at(c, work, u_0 + BLOCK * i - 0.5, v_0 + BLOCK * j - 0.5)
+                possible = 0
+                for k in range(len(work[3])):
+                    possible += work[3][k]
+                if possible != work[1][-1, -1]:
+                    seen[j, i] = 0
+
+
+@njit(cache=True, nogil=True)
+def _even(I: Any, seen: Any, j: int, i: int) -> bool:
+    """Whether cubic interpolation between coarse corners (j, i) and (j + 1, i + 1) stands for the rays there."""
+    if j < 1 or i < 1 or j + 2 >= I.shape[0] or i + 2 >= I.shape[1] or seen[j, i] == 0:
+        return False
+    for a in range(j - 1, j + 3):
+        for b in range(i - 1, i + 3):
+            if seen[a, b] != seen[j, i]:
+                return False
+        if abs(I[a, i - 1] - 3 * I[a, i] + 3 * I[a, i + 1] - I[a, i + 2]) > EVEN:
+            return False
+    largest = 0.0
+    for b in range(i - 1, i + 3):
+        largest = max(largest, abs(I[j - 1, b] - 3 * I[j, b] + 3 * I[j + 1, b] - I[j + 2, b]))
+    return largest <= EVEN
+
+
+@njit(cache=True, nogil=True)
+def _corners(
+    c: Any,
+    depth: int,
+    u_0: int,
+    v_0: int,
+    mask: Any,
+    rough: Any,
+    rough_seen: Any,
+    j_0: int,
+    j_1: int,
+    I: Any,
+    seen: Any,
+) -> bool:
+    """Transmission and signature at the pixels' corners, rows j_0 to j_1; False where a list overflowed.
+
+    rough, rough_seen: coarse corners (`_coarse`), or arrays of no rows where every ray is to be cast.
+    """
+    work = _work_space(c, depth)
+    fine = True
+    even = np.zeros(I.shape[1] // BLOCK + 1, dtype=np.bool_)
+    for j in range(j_0, j_1):
+        J, y = j // BLOCK, (j % BLOCK) / BLOCK
+        if j == j_0 or y == 0:
+            for K in range(len(even)):
+                even[K] = rough.shape[0] > 0 and _even(rough, rough_seen, J, K)
+        w_y = (
+            -y * (y - 1) * (y - 2) / 6,
+            (y + 1) * (y - 1) * (y - 2) / 2,
+            -(y + 1) * y * (y - 2) / 2,
+            (y + 1) * y * (y - 1) / 6,
+        )
+        for i in range(I.shape[1]):
+            I[j, i], seen[j, i] = 1.0, 0
+            K = i // BLOCK
+            if even[K]:
+                x = (i % BLOCK) / BLOCK
+                w_x = (
+                    -x * (x - 1) * (x - 2) / 6,
+                    (x + 1) * (x - 1) * (x - 2) / 2,
+                    -(x + 1) * x * (x - 2) / 2,
+                    (x + 1) * x * (x - 1) / 6,
+                )
+                total = 0.0
+                for a in range(4):
+                    for b in range(4):
+                        total += w_y[a] * w_x[b] * rough[J - 1 + a, K - 1 + b]
+                I[j, i], seen[j, i] = total, rough_seen[J, K]
+            elif mask[j, i]:
                 I[j, i], seen[j, i] = _at(c, work, u_0 + i - 0.5, v_0 + j - 0.5)
                 if seen[j, i] < 0:
                     fine = False
@@ -397,6 +477,13 @@ def shadow_boxes(outlines: list[tuple[Frame, Array]], view: View, T_FW: dict[Fra
     return boxes
 
 
+def _without_small_parts(compiled: Compiled, boxes: Array) -> bool:
+    """Whether every primitive is so large on the panel that none can hide between coarse corners."""
+    size = np.linalg.norm(compiled.t.max(axis=0) - compiled.t.min(axis=0)) + 2 * compiled.radius.max()
+    px_per_mm = max(np.ptp(boxes[:, :, 0]), np.ptp(boxes[:, :, 1])) / size
+    return bool(compiled.smallest * px_per_mm > SMALL_PX)
+
+
 def add_transmission(
     out: Any,
     window: Window,
@@ -444,9 +531,12 @@ def add_transmission(
         mask[j, i] = True
     common = (c, compiled.depth, window.u_0, window.v_0)
     fine = [True]
+    shape = (window.n_v // BLOCK + 1, window.n_u // BLOCK + 1) if _without_small_parts(compiled, boxes) else (0, 0)
+    rough_I, rough_seen = np.empty(shape), np.empty(shape, dtype=np.int64)
+    in_bands(lambda lo, hi: _coarse(*common, mask, lo, hi, rough_I, rough_seen), shape[0], threads)
 
     def corners(lo: int, hi: int) -> None:
-        if not _corners(*common, mask, lo, hi, I, seen):
+        if not _corners(*common, mask, rough_I, rough_seen, lo, hi, I, seen):
             fine[0] = False
 
     in_bands(corners, window.n_v + 1, threads)

@@ -33,7 +33,8 @@ class Compiled:
     kind (n,), p (n, 3), R (n, 3, 3), t (n, 3): primitives, x_local = R' (x - t).  ops: postfix programs, first[k] to
     first[k + 1] for solid k: a primitive's number, or -1 union, -2 intersection, -3 difference.  material (m,): index
     into `materials`.  centre (m, 3), radius (m,): bounding spheres.  frame (m,), solid (n,): whose frame, whose
-    primitive.  corners: m arrays (k, 3) of points whose convex hull holds the solid.
+    primitive.  corners: m arrays (k, 3) of points whose convex hull holds the solid.  smallest: half the shortest side
+    of any primitive, mm.
     """
 
     kind: Any
@@ -49,6 +50,7 @@ class Compiled:
     frame: tuple[Frame, ...]
     solid: Any
     corners: tuple[Array, ...]
+    smallest: float
     depth: int
 
     def in_world(self, T_FW: dict[Frame, RigidTransform]) -> tuple[Array, Array, Array]:
@@ -105,6 +107,7 @@ def compile_solids(solids: list[Solid] | tuple[Solid, ...]) -> Compiled:
         frame=tuple(s.frame for s in solids),
         solid=np.array(owner, dtype=np.int64),
         corners=tuple(s.shape.corners() for s in solids),
+        smallest=min(min(q.half) for q in primitives),
         depth=depth,
     )
 
@@ -396,11 +399,13 @@ def trace(
     active (m,): which solids can be met at all.  o, d: origin and unit direction.  T (depth + 3, LARGEST), S (the
         same, one column more) int64: work space.  The
     signature numbers the surfaces crossed in their order: rays that share it are joined by a smooth change of path.
+    S's last corner then holds how many solids were met.
     """
     for m in range(len(L)):
         L[m] = 0.0
     signature = np.int64(0)
     spare = T.shape[0] - 1
+    met = 0
     taken, other, n_taken = T.shape[0] - 2, T.shape[0] - 3, 0
     # Later solids displace earlier ones: walk backwards and keep what is taken already.
     for k in range(len(first) - 2, -1, -1):
@@ -438,6 +443,7 @@ def trace(
             S[top - 1, LARGEST] = n_now
         if n_now == 0:
             continue
+        met += 1
         row, n_row = 0, n_now
         if n_taken > 0:
             row, n_row = spare, _combine(T, S, 0, n_now, taken, n_taken, -3, spare)
@@ -454,6 +460,7 @@ def trace(
             if n_taken < 0:
                 return np.int64(-1)
             taken, other = other, taken
+    S[spare, LARGEST] = met
     return signature
 
 
