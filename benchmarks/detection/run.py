@@ -21,10 +21,10 @@ import tifffile
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "detection"))
 
-from ball_images import cramer_rao, frame, noise_free, noisy, standard_scene, window  # noqa: E402
+from ball_images import cramer_rao, frame, noise_free, noisy, standard_scene, window
 
-from tomopose import Scanner  # noqa: E402
-from tomopose.detection import detect, detect_image  # noqa: E402
+from tomopose import Scanner
+from tomopose.detection import detect, detect_image
 
 ROWS: list[tuple[str, str, str]] = []
 
@@ -54,7 +54,7 @@ def canny_ellipse(image: np.ndarray, scanner: Scanner, origin: tuple[int, int]) 
 def opencv_ellipse(image: np.ndarray, scanner: Scanner, origin: tuple[int, int]) -> np.ndarray:
     import cv2
 
-    eight = np.clip(255 * image / np.percentile(image, 95), 0, 255).astype(np.uint8)
+    eight = np.clip(image * (255.0 / np.percentile(image, 95)), 0, 255).astype(np.uint8)
     _, dark = cv2.threshold(eight, 128, 255, cv2.THRESH_BINARY_INV)
     contours, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     (xc, yc), axes, _ = cv2.fitEllipse(max(contours, key=cv2.contourArea))
@@ -80,10 +80,10 @@ def against_the_bound(crops: int) -> None:
     for magnification in (2.7, 5.3):
         rng = np.random.default_rng(round(10 * magnification))
         scenes = [standard_scene(magnification, du=a, dv=b, blur=s) for (a, b), s in
-                  zip(rng.uniform(-0.5, 0.5, (8, 2)), np.linspace(0.6, 0.8, 8))]  # fmt: skip
+                  zip(rng.uniform(-0.5, 0.5, (8, 2)), np.linspace(0.6, 0.8, 8), strict=True)]  # fmt: skip
         boxes = [window(s) for s in scenes]
-        clean = [noise_free(s, **b) for s, b in zip(scenes, boxes)]
-        unit = [np.trace(cramer_rao(s, b, 1.0)) for s, b in zip(scenes, boxes)]
+        clean = [noise_free(s, **b) for s, b in zip(scenes, boxes, strict=True)]
+        unit = [np.trace(cramer_rao(s, b, 1.0)) for s, b in zip(scenes, boxes, strict=True)]
         for snr in (25, 50, 100, 200, 400, 800):
             error, squares = [], []
             for k in range(crops):

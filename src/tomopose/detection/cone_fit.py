@@ -17,7 +17,7 @@ import numpy.typing as npt
 from tomopose.detection.cholesky import solve
 from tomopose.detection.cone import cone_angle, cone_coordinates, ring_pixels
 from tomopose.detection.edges import FIRST_NODE, N_SHAPE, SHAPE, WHITE, influence, model_rows, normal_equations
-from tomopose.detection.noise import correlation, sandwich
+from tomopose.detection.noise import correlation, sandwich, sector_median
 from tomopose.detection.profile import edge_profile
 from tomopose.errors import BallNotFoundError
 from tomopose.geometry.scanner import Scanner
@@ -260,7 +260,10 @@ def fit_cone(
     for turn in range(3):
         v_in, v_out, excess = _weigh(rim, floor, 2.0 if turn == 0 else 2.5)
         widest = (rim.reach**2 / (STEEPEST * spread)) ** 2
-        rim.precision[2::3] = widest if turn < 1 else np.maximum(_curvature_precision(rim, active), widest)
+        if turn == 0:
+            rim.precision[2::3] = widest
+        elif turn == 1:
+            rim.precision[2::3] = np.maximum(_curvature_precision(rim, active), widest)
         for _ in range(3 if kappa_free else 1 if turn < 2 else 4):
             if rim.step(active, careful=kappa_free) < 1e-4:
                 break
@@ -367,7 +370,7 @@ def _weigh(rim: _Rim, floor: float, parameters: float) -> tuple[float, float, Ar
     s, sigma, k = rim.rim[:, 0], rim.shape[3], rim.n_nodes
     square = rim.residual**2
     outside, inside = s > 3 * sigma, s < -3 * sigma
-    limit = OUTLIER**2 * (_sector_median(square[outside], rim.left[outside], k)[rim.left] / 0.455 + floor)
+    limit = OUTLIER**2 * (sector_median(square[outside], rim.left[outside], k)[rim.left] / 0.455 + floor)
     rim_zone = ~(outside | inside)
     if rim_zone.any():
         limit[rim_zone] = np.maximum(limit[rim_zone], OUTLIER**2 * np.median(square[rim_zone]) / 0.455)
@@ -386,17 +389,6 @@ def _weigh(rim: _Rim, floor: float, parameters: float) -> tuple[float, float, Ar
     chi2 = np.bincount(rim.left, weights=square * (used & outside) / expected, minlength=k) / np.maximum(n_k, 1)
     rim.weight = np.where(used, 1.0 / expected, 0.0)
     return v_in, v_out, (chi2 - 1.0) / np.sqrt(2.0 / np.maximum(n_k, 1))
-
-
-def _sector_median(values: Array, sector: Array, k: int) -> Array:
-    """Median of the values in each of k sectors; of all values where a sector has none."""
-    out = np.full(k, float(np.median(values)) if values.size else 0.0)
-    order = np.argsort(sector, kind="stable")
-    edges = np.searchsorted(sector[order], np.arange(k + 1))
-    for n in range(k):
-        if edges[n + 1] > edges[n]:
-            out[n] = np.median(values[order[edges[n] : edges[n + 1]]])
-    return out
 
 
 def _curvature_precision(rim: _Rim, active: npt.NDArray[np.intp]) -> Array:

@@ -16,7 +16,7 @@ from tomopose.detection.pyramid import LARGEST, SMALLEST, block_mean, circle_cen
 from tomopose.errors import AmbiguousBallError, BallNotFoundError, BallTruncatedError
 from tomopose.units import Array
 
-RAYS = 96
+RAYS = 72
 COMPLETE = 0.62
 """Least share of the visible rim that must agree with a circle."""
 SIGNIFICANT = 4.0

@@ -15,6 +15,26 @@ SMALLEST = 0.06
 """Correlation of neighbours below which noise counts as white: a holder leaves some in the residuals too."""
 
 
+@njit(cache=True)
+def sector_median(values, sector, k):  # type: ignore[no-untyped-def]
+    """Median of the values in each of k sectors; the largest of these where a sector has no value."""
+    count = np.zeros(k + 1, np.int64)
+    for i in range(sector.shape[0]):
+        count[sector[i] + 1] += 1
+    first = np.cumsum(count)
+    place = first.copy()
+    ordered = np.empty(values.shape[0])
+    for i in range(sector.shape[0]):
+        ordered[place[sector[i]]] = values[i]
+        place[sector[i]] += 1
+    out = np.full(k, np.nan)
+    for n in range(k):
+        if first[n + 1] > first[n]:
+            out[n] = np.median(ordered[first[n] : first[n + 1]])
+    largest = np.nanmax(out) if np.any(~np.isnan(out)) else 0.0
+    return np.where(np.isnan(out), largest, out)
+
+
 def correlation(u: Array, v: Array, normalised: Array, per_parameter: float) -> Array:
     """Autocorrelation (2 REACH + 1, 2 REACH + 1) of normalised residuals at pixels u, v; a delta where it is white.
 

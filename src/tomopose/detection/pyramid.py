@@ -9,6 +9,8 @@ from numba import njit
 
 from tomopose.units import Array
 
+MOST = 10
+"""Centres of a level that are looked at, those with most votes."""
 SMALLEST, LARGEST = 3.4, 14.5
 """Radii, in px of a level, that are looked for on it; levels follow by factors of 2."""
 BANDS = ((3.4, 5.6), (5.6, 9.0), (9.0, 14.5))
@@ -129,9 +131,9 @@ def circle_centres(level: Array, most: int = 3) -> tuple[float, list[tuple[float
     if not top > threshold:
         return math.sqrt(noise), []
     votes = _votes(level, square, np.float32(threshold), np.array(BANDS))
-    found = []
+    found: list[tuple[float, float, float, float, float, int]] = []
     for polarity in range(2):
         for band, (low, high) in enumerate(BANDS):
-            for u, v, _ in _peaks(votes[polarity, band], 1 if band == 0 else 2, 0.3, most):
-                found.append((float(u), float(v), low, high, polarity))
-    return math.sqrt(noise), found
+            for u, v, count in _peaks(votes[polarity, band], 1 if band == 0 else 2, 0.3, most):
+                found.append((-float(count), float(u), float(v), low, high, polarity))
+    return math.sqrt(noise), [f[1:] for f in sorted(found)[:MOST]]
