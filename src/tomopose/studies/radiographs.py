@@ -45,9 +45,14 @@ class BallRun:
     snr: float = SNR
 
     @property
+    def alpha(self) -> Array:
+        """Table angles (n,), rad."""
+        return np.zeros(len(self.poses)) if self.poses.alpha is None else self.poses.alpha
+
+    @property
     def x_D(self) -> Array:
         """True projected centres (n, 2), px."""
-        return project_ball(self.scanner, T_HT=self.T_HT, T_MH=self.T_MH, t=self.t, alpha=self.poses.alpha)
+        return project_ball(self.scanner, T_HT=self.T_HT, T_MH=self.T_MH, t=self.t, alpha=self.alpha)
 
 
 @dataclass(frozen=True, kw_only=True)
