@@ -13,6 +13,7 @@ from tomopose.calibration.kinematic_trajectory import object_points, rms_px, tra
 from tomopose.calibration.solve import calibrate
 from tomopose.geometry.projection import eq5_matrices, project_ball
 from tomopose.geometry.rotations import R_y, R_z
+from tomopose.manipulator.real_poses import Repeatability
 from tomopose.manipulator.serial import poses_from_joints
 from tomopose.manipulator.virtual import Disturbance, real_motion
 
@@ -76,7 +77,7 @@ def experiment(
     rng: np.random.Generator, believed: Any = None, disturbance: Disturbance | None = None, scanner: Scanner = SCANNER,
     centre: Any = None,
 ) -> Experiment:
-    """Image the balls on the real machine; the scan is executed by the same machine.
+    """Image the balls on the real machine; the scan is executed by the same machine, cool and without scatter.
 
     centre: middle of the object in M, mm, where it is not what stands at the W origin at home (a robot's flange).
     """
@@ -89,7 +90,11 @@ def experiment(
     observations = BallObservations.from_sigma(
         x + sigma * rng.standard_normal(x.shape), sigma, pose_id=poses.pose_id
     )
-    scanned = real_motion(machine, scan, p, )
+    # wear stays, warmth and scatter belong to the run
+    still = replace(
+        disturbance, growth_mm=(0.0, 0.0, 0.0), growth_rad=(0.0, 0.0, 0.0), scatter=Repeatability(t_mm=0.0, w_rad=0.0)
+    )
+    scanned = real_motion(machine, scan, p, disturbance=still)
     home = scanner.T_TW(0.0) @ T_HT
     return Experiment(
         machine=machine if believed is None else believed, poses=poses, observations=observations, scan=scan,

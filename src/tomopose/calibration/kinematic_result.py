@@ -24,8 +24,8 @@ RUN_EFFECTS_FOUND = (
     "during the run the manipulator drifted or its drives lagged (drift and lag are among the parameters): the scan "
     "may be off by as much again"
 )
-LARGE_SCATTER = 9.0
-"""A scatter whose variance is this many times the stated one means an error that no model here holds."""
+NOTABLE_SCATTER, LARGE_SCATTER = 1.5, 9.0
+"""Times the stated variance: a scatter that is no chance; one that means an error which no model here holds."""
 
 
 def comparison(
@@ -88,6 +88,7 @@ def calibration_of(
             f"the radiographs determine {gamma:.1f} of {m} errors of the manipulator; the others, and shifts and turns "
             "of whole plates, which the mount and the ball take up, stay at their priors"
         )
+    block["unmodelled"] = bool(problem.scatter > NOTABLE_SCATTER or isinstance(problem.model, WithRunEffects))
     block["scatter"] = {
         "t_mm": problem.repeatability.t_mm * np.sqrt(problem.scatter),
         "w_rad": problem.repeatability.w_rad * np.sqrt(problem.scatter),

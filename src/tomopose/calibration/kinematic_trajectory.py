@@ -101,14 +101,19 @@ def trajectory_jacobian(calibration: Calibration, poses: PoseSequence, points: A
     return flat.reshape(J.shape), J_pose
 
 
-def trajectory_sigma(calibration: Calibration, poses: PoseSequence, points: Any, *, scatter: bool = False) -> Array:
+def trajectory_sigma(
+    calibration: Calibration, poses: PoseSequence, points: Any, *, scatter: bool | None = None
+) -> Array:
     """(n, m, 2) px: standard uncertainty of points (m, 3) of W at home in a scan, the object's rigid pose removed.
 
-    scatter: add how far the plate will stand off from pose to pose (the identified scatter), for the single view.
+    scatter: add how far the plate stands off from pose to pose (the identified scatter), for the single view; None:
+    where the run showed wear or more scatter than the repeatability, since a scan will show it again.
     """
     J, J_pose = trajectory_jacobian(calibration, poses, points)
     V = np.einsum("nmic,cd,nmid->nmi", J, calibration.covariance, J, optimize=True)
     found = calibration.manipulator.get("scatter")
+    if scatter is None:
+        scatter = bool(calibration.manipulator.get("unmodelled", False))
     if scatter and found is not None:
         variance = np.repeat([found["w_rad"] ** 2, found["t_mm"] ** 2], 3)
         V = V + np.einsum("nmia,a,nmia->nmi", J_pose, variance, J_pose, optimize=True)

@@ -4,6 +4,8 @@
 
     {"kind": "hexapod" | "serial" | "map",  "nominal": the machine as in its file,
      "names", "values", "units", "u": of its errors,
+     "scatter": {"t_mm", "w_rad"} of the plate from pose to pose, "unmodelled": whether the run showed wear or more
+     of it than the repeatability,
      "translation_scale": factor on the plate's shifts, where it was freed and is not 1,
      "range": {"t_mm": [low (3), high (3)], "w_rad": [low, high]}: of the calibration's poses}
 
