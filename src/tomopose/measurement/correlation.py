@@ -3,6 +3,9 @@
 With a correlation rho(h) of the residuals at distance h, the mean of n points has the variance
 
     s^2 / n * (1 + mean over points of the sum of rho over their neighbours) = s^2 / n_eff.
+
+A fit of p parameters takes about p / n_eff away from the correlation of its residuals at every distance; that is put
+back.
 """
 
 from __future__ import annotations
@@ -14,11 +17,11 @@ import numpy as np
 from tomopose.errors import InputError
 from tomopose.units import Array
 
-SAMPLES, BINS = 4000, 12
+SAMPLES, BINS, ROUNDS = 4000, 12, 5
 
 
-def effective_number(points: Array, residuals: Array, correlation_range: float) -> float:
-    """n_eff of points (n, 3), mm, with residuals (n,), looking at pairs up to `correlation_range`, mm.
+def effective_number(points: Array, residuals: Array, correlation_range: float, parameters: int = 0) -> float:
+    """n_eff of points (n, 3), mm, with residuals (n,) of a fit, looking at pairs up to `correlation_range`, mm.
 
     rho is estimated in bins of distance and taken as zero from its first bin that is not positive on.  0 for the range
     gives n.  The result lies between 1 and n.
@@ -45,6 +48,10 @@ def effective_number(points: Array, residuals: Array, correlation_range: float) 
     product = np.bincount(bin_of, weights=residuals[first] * residuals[second], minlength=BINS)
     rho = np.divide(product, count * variance, out=np.zeros(BINS), where=count > 0)
     stops = np.flatnonzero((rho <= 0) & (count > 0))
-    rho[stops[0] if stops.size else BINS:] = 0.0
-    inflation = 1.0 + float(np.sum(rho * count)) / len(chosen)
-    return float(np.clip(n / inflation, 1.0, n))
+    end = stops[0] if stops.size else BINS
+    n_effective = float(n)
+    for _ in range(ROUNDS):
+        lost = parameters / n_effective
+        inflation = 1.0 + float(np.sum((rho[:end] + lost) / (1.0 + lost) * count[:end])) / len(chosen)
+        n_effective = float(np.clip(n / inflation, 1.0, n))
+    return n_effective

@@ -164,7 +164,7 @@ def _fit(
         if np.array_equal(keep, used):
             break
         used = keep
-    n_effective = effective_number(x[used], (d / s)[used], correlation_range)
+    n_effective = effective_number(x[used], (d / s)[used], correlation_range, sum(b.J.shape[1] for b in blocks))
     share = n_effective / int(used.sum())
     return Feature(
         kind=kind, vector=vector, covariance=sum((_covariance(b, share) for b in blocks), np.zeros((8, 8))),
@@ -295,6 +295,9 @@ def _circle(points: Array, sigma: Array) -> tuple[Array, list[Block]]:
 
 def _about_axis(kind: str, points: Array, sigma: Array, direction: Any) -> tuple[Array, list[Block]]:
     x, centre, scale = _scaled(points)
+    spread = np.linalg.svd(x, compute_uv=False)
+    if spread[1] <= DEGENERATE * spread[0]:
+        raise InputError(f"all {len(points)} points of a {kind} lie on a line; give points beside it")
     some = x[:: max(len(x) // START_POINTS, 1)]
     if direction is None:
         # The principal axes are added: long or short pieces have their axis along one of them.
