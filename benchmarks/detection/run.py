@@ -95,8 +95,10 @@ def against_the_bound(crops: int) -> None:
                 squares.append(d @ np.linalg.solve(ball.covariance, d) / 2)
             goal = {50: "1.25", 100: "1.25", 200: "1.25", 400: "1.6"}.get(snr, "")
             ratio, spread = rms(np.array(error)), np.sqrt(1 / (2 * crops)) / np.sqrt(2)
-            say(f"error / bound, M {magnification}, SNR {snr}, {crops} crops", f"{ratio:.2f} +- {ratio * spread:.2f}", goal)
-            say("  variance of the normalised errors", f"{np.mean(squares):.2f} +- {1 / np.sqrt(crops):.2f}", "0.9 to 1.1")
+            name = f"error / bound, M {magnification}, SNR {snr}, {crops} crops"
+            say(name, f"{ratio:.2f} +- {ratio * spread:.2f}", goal)
+            chance = 1 / np.sqrt(crops)
+            say("  variance of the normalised errors", f"{np.mean(squares):.2f} +- {chance:.2f}", "0.9 to 1.1")
 
 
 def third_party(shared: Path) -> None:
@@ -166,15 +168,17 @@ def speed(frames: int) -> None:
         wall = (time.perf_counter() - wall) / n
     say("2048 x 2048 TIFF: read alone", f"{1e3 * read:.1f} ms CPU a frame")
     say("2048 x 2048 TIFF: read + find + fit", f"{1e3 * full:.1f} ms CPU = {full / read:.1f} x reading; "
-        f"2 cores: {2 / full:.0f} frames/s by CPU time, {1 / wall:.0f} by the clock", "100 frames/s or 2.5 x reading")  # fmt: skip
+        f"2 cores: {2 / full:.0f} a second by CPU time, {1 / wall:.0f} by the clock",
+        "100 frames a second or 2.5 x reading")  # fmt: skip
     say("  tracked", f"{1e3 * tracked:.1f} ms CPU", "1.3 x the region read")
 
 
-def memory() -> None:
-    """Resident memory of a process that detects in 2,000 frames of 4096 x 4096, made one at a time."""
+def memory(frames_in_all: int) -> None:
+    """Resident memory of a process that detects in frames of 4096 x 4096, made one at a time."""
     if "--memory-child" not in sys.argv:
-        out = subprocess.run([sys.executable, __file__, "--memory-child"], capture_output=True, text=True, check=True)
-        say("memory, 2,000 frames of 4096 x 4096, peak of the process", out.stdout.strip(), "below 1 GiB")
+        child = [sys.executable, __file__, "--memory-child", "--memory-frames", str(frames_in_all)]
+        out = subprocess.run(child, capture_output=True, text=True, check=True)
+        say(f"memory, {frames_in_all} frames of 4096 x 4096, peak of the process", out.stdout.strip(), "below 1 GiB")
         return
     scanner = Scanner(d_SD=1500.0, d_SR=300.0, p_u=0.1, p_v=0.1, u_0=2047.5, v_0=2047.5, n_u=4096, n_v=4096)
     v, u = np.mgrid[:4096, :4096].astype(np.float32)
@@ -184,10 +188,10 @@ def memory() -> None:
     after_setup = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
 
     def frames() -> Iterator[np.ndarray]:
-        for _ in range(2000):
+        for _ in range(frames_in_all):
             yield image.copy()
 
-    predicted = np.tile([2000.4, 1900.7], (2000, 1))
+    predicted = np.tile([2000.4, 1900.7], (frames_in_all, 1))
     seen = detect(frames(), scanner, predicted=predicted, workers=1).seen.sum()
     detect([image], scanner)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
@@ -201,10 +205,11 @@ def main() -> None:
     default = os.environ.get("TOMOPOSE_SHARED", Path(__file__).resolve().parents[3] / "shared")
     parser.add_argument("--shared", type=Path, default=Path(default), help="folder that holds data/")
     parser.add_argument("--skip", default="", help="bound,gvxr,speed,memory: those to leave out")
+    parser.add_argument("--memory-frames", type=int, default=2000, help="frames of the memory figure")
     parser.add_argument("--memory-child", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.memory_child:
-        memory()
+        memory(options.memory_frames)
         return
     print(f"{'figure':58s} | {'measured':44s} | goal")
     skip = options.skip.split(",")
@@ -215,7 +220,7 @@ def main() -> None:
     if "bound" not in skip:
         against_the_bound(options.crops)
     if "memory" not in skip:
-        memory()
+        memory(options.memory_frames)
 
 
 if __name__ == "__main__":
