@@ -12,8 +12,8 @@ from scipy.special import ndtr
 
 from tomopose.geometry.frames import Frame
 from tomopose.simulation.materials import attenuation
-from tomopose.simulation.projector import View
 from tomopose.simulation.run import SimulatedRun
+from tomopose.simulation.view import View
 
 
 def ball_image(run: SimulatedRun, i: int, window: tuple[int, int, int, int], *, n: int = 96, sigma: float) -> Any:

@@ -25,13 +25,13 @@ from tomopose.simulation.gvxr import path_images
 from tomopose.simulation.materials import attenuation, from_formula
 from tomopose.simulation.mesh import Mesh, MeshSolid, mesh_paths
 from tomopose.simulation.noise import add_photon_noise, frame_key
-from tomopose.simulation.projector import View
 from tomopose.simulation.rays import compile_solids, path_lengths
 from tomopose.simulation.run import SimulatedRun, simulate_ball_run, transmission
 from tomopose.simulation.shapes import Solid, sphere
 from tomopose.simulation.specimen import specimen_mesh
 from tomopose.simulation.standard import multi_sphere_standard
 from tomopose.simulation.tessellate import tessellate
+from tomopose.simulation.view import View
 
 FULL = Scanner(d_SD=1500.0, d_SR=283.5, p_u=0.2, p_v=0.2, u_0=1021.37, v_0=1026.81, n_u=2048, n_v=2048)
 T_HT = RigidTransform.from_angles([0.0071, 0.0048, 3.1261], [-1.9, 2.6, 1.4], source=Frame.H, target=Frame.T)

@@ -65,7 +65,7 @@ def _reduce_columns(rows: Any, k: Any, f: int, half: int, j_0: int, j_1: int, ou
 def to_pixels(cells: Any, *, f: int, sigma_u: float, sigma_v: float, threads: int = 1) -> Array:
     """Pixel values (n_v, n_u) of cells (4, n_v f, n_u f; see `add_transmission`) under a Gaussian blur of sigma_u,
     sigma_v px."""
-    from tomopose.simulation.projector import in_bands
+    from tomopose.simulation.view import in_bands
 
     n_v, n_u = cells.shape[1] // f, cells.shape[2] // f
     half_u, half_v = margin(sigma_u), margin(sigma_v)

@@ -19,7 +19,7 @@ from tomopose.errors import InputError
 from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 from tomopose.simulation.effects import MTF, Glare, Scatter
 from tomopose.simulation.noise import add_normal_noise, add_photon_noise, digitise, frame_key
-from tomopose.simulation.projector import in_bands
+from tomopose.simulation.view import in_bands
 from tomopose.units import Array
 
 PATTERN, FLATS = 1, 2

@@ -14,7 +14,7 @@ import numpy as np
 from tomopose.errors import EngineFailedError, EngineMissingError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.simulation.projector import View, Window
+from tomopose.simulation.view import View, Window
 from tomopose.units import Array
 
 if TYPE_CHECKING:

@@ -9,9 +9,10 @@ import numpy as np
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.simulation.mesh import MeshSolid
-from tomopose.simulation.projector import View, Window, fill_smooth, in_bands
+from tomopose.simulation.projector import fill_smooth
 from tomopose.simulation.rays import Compiled, path_lengths
 from tomopose.simulation.spectrum import Beam
+from tomopose.simulation.view import View, Window, in_bands
 from tomopose.units import Array
 
 POINTS, STEP = 13, 8

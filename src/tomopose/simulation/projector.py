@@ -11,20 +11,18 @@ transmission), so that an edge keeps its place inside its cell.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numba import njit
 
-from tomopose.errors import InputError, OutOfViewError
+from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
-from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.simulation.rays import LARGEST, Compiled, trace
+from tomopose.simulation.rays import LARGEST, Compiled
+from tomopose.simulation.sampling import BLOCK, all_corners, at, coarse_corners, work_space
 from tomopose.simulation.spectrum import Beam
+from tomopose.simulation.view import View, Window, in_bands, shadow_boxes
 from tomopose.units import Array
 
 LATTICES = ((5, 3), (13, 8))
@@ -34,190 +32,10 @@ FLAT = 2e-3
 an edge is cut exactly."""
 HALVINGS = 9
 GAUSS = np.stack([(np.polynomial.legendre.leggauss(4)[0] + 1) / 2, np.polynomial.legendre.leggauss(4)[1] / 2], axis=1)
-BLOCK = 4
-"""Between every fourth corner rays are interpolated where all around sees the same, smoothly."""
-EVEN = 5e-4
-"""Largest third difference of transmission over coarse corners that counts as smooth."""
 SMALL_PX = 8.0
 """Where a primitive is thinner than this (half its side, px), every ray is cast."""
-OPAQUE = 30.0
-"""exp(-30) = 1e-13: nothing gets through."""
-STEPS = 128
-DECAY = np.exp(-np.arange(OPAQUE * STEPS + 1) / STEPS)
 SMOOTH = 2e-4
 """Largest third difference of transmission over the corners that counts as smooth."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class View:
-    """Where one frame looks from: source (3,), pixel (0, 0)'s centre O, pixel steps U and V (3,), in W, mm."""
-
-    source: Array
-    O: Array
-    U: Array
-    V: Array
-
-    @classmethod
-    def of(cls, scanner: Scanner, source_shift: Any = (0.0, 0.0, 0.0)) -> View:
-        """The scanner's view; source_shift (3,) mm moves the source in S against the panel (focal spot)."""
-        U, V, O = scanner.panel
-        T_SW = scanner.T_WS.inv
-        return cls(
-            source=T_SW.apply(np.asarray(source_shift, dtype=np.float64)), O=T_SW.apply(O), U=T_SW.R @ U, V=T_SW.R @ V
-        )
-
-    def project(self, x: Array) -> Array:
-        """Pixels (m, 2) of points (m, 3) of W; OutOfViewError where one lies behind the source."""
-        h = np.linalg.solve(np.column_stack([self.U, self.V, self.O - self.source]), (x - self.source).T)
-        if (h[2] <= 0).any():
-            raise OutOfViewError("the object reaches behind the source; move it away from it or make it smaller")
-        return np.asarray((h[:2] / h[2]).T)
-
-
-def in_bands(work: Callable[[int, int], None], n: int, threads: int) -> None:
-    """work(lo, hi) over [0, n) in bands of rows, on that many threads (the kernels release the interpreter's lock)."""
-    if threads <= 1 or n < 2 * threads:
-        work(0, n)
-        return
-    step = max(1, n // (8 * threads))
-    starts = range(0, n, step)
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(lambda lo: work(lo, min(lo + step, n)), starts))
-
-
-@njit(cache=True, nogil=True)
-def _work_space(c: Any, depth: int) -> Any:
-    """(T, S, L, active) for `trace`: each band of rows has its own."""
-    mu, boxes = c[10], c[15]
-    return (
-        np.empty((depth + 3, LARGEST)),
-        np.empty((depth + 3, LARGEST + 1), dtype=np.int64),
-        np.empty(mu.shape[1]),
-        np.empty(len(boxes), dtype=np.bool_),
-    )
-
-
-@njit(cache=True, nogil=True)
-def _at(c: Any, work: Any, u: float, v: float) -> Any:
-    """(transmission, signature) at pixel coordinates (u, v)."""
-    kind, p, R, t, ops, first, material, centre, radius, w, mu, s, O, U, V, boxes = c
-    T, S, L, active = work
-    nothing = True
-    for k in range(len(active)):
-        active[k] = boxes[k, 0, 0] <= u <= boxes[k, 1, 0] and boxes[k, 0, 1] <= v <= boxes[k, 1, 1]
-        nothing = nothing and not active[k]
-    if nothing:
-        return 1.0, np.int64(0)
-    dx, dy, dz = (
-        O[0] + u * U[0] + v * V[0] - s[0],
-        O[1] + u * U[1] + v * V[1] - s[1],
-        O[2] + u * U[2] + v * V[2] - s[2],
-    )
-    h = 1 / np.sqrt(dx * dx + dy * dy + dz * dz)
-    signature = trace(
-        kind, p, R, t, ops, first, material, centre, radius, active, s[0], s[1], s[2], h * dx, h * dy, h * dz, T, S, L
-    )
-    if signature == 0:
-        return 1.0, signature
-    total = 0.0
-    for e in range(len(w)):
-        x = 0.0
-        for m in range(len(L)):
-            x += mu[e, m] * L[m]
-        if x < OPAQUE:
-            # exp(-x) from a table and three terms of the series, to 2e-10.
-            k = int(x * STEPS)
-            r = x - k / STEPS
-            total += w[e] * DECAY[k] * (1 - r * (1 - r * (0.5 - r / 6)))
-    return total, signature
-
-
-@njit(cache=True, nogil=True)
-def _coarse(c: Any, depth: int, u_0: int, v_0: int, mask: Any, j_0: int, j_1: int, I: Any, seen: Any) -> None:
-    """Every BLOCK-th corner, rows j_0 to j_1 of them; seen is 0 where nothing is met, or less than may be met."""
-    work = _work_space(c, depth)
-    for j in range(j_0, j_1):
-        for i in range(I.shape[1]):
-            I[j, i], seen[j, i] = 1.0, 0
-            if mask[BLOCK * j, BLOCK * i]:
-                I[j, i], seen[j, i] = _at(c, work, u_0 + BLOCK * i - 0.5, v_0 + BLOCK * j - 0.5)
-                possible = 0
-                for k in range(len(work[3])):
-                    possible += work[3][k]
-                if possible != work[1][-1, -1]:
-                    seen[j, i] = 0
-
-
-@njit(cache=True, nogil=True)
-def _even(I: Any, seen: Any, j: int, i: int) -> bool:
-    """Whether cubic interpolation between coarse corners (j, i) and (j + 1, i + 1) stands for the rays there."""
-    if j < 1 or i < 1 or j + 2 >= I.shape[0] or i + 2 >= I.shape[1] or seen[j, i] == 0:
-        return False
-    for a in range(j - 1, j + 3):
-        for b in range(i - 1, i + 3):
-            if seen[a, b] != seen[j, i]:
-                return False
-        if abs(I[a, i - 1] - 3 * I[a, i] + 3 * I[a, i + 1] - I[a, i + 2]) > EVEN:
-            return False
-    largest = 0.0
-    for b in range(i - 1, i + 3):
-        largest = max(largest, abs(I[j - 1, b] - 3 * I[j, b] + 3 * I[j + 1, b] - I[j + 2, b]))
-    return largest <= EVEN
-
-
-@njit(cache=True, nogil=True)
-def _corners(
-    c: Any,
-    depth: int,
-    u_0: int,
-    v_0: int,
-    mask: Any,
-    rough: Any,
-    rough_seen: Any,
-    j_0: int,
-    j_1: int,
-    I: Any,
-    seen: Any,
-) -> bool:
-    """Transmission and signature at the pixels' corners, rows j_0 to j_1; False where a list overflowed.
-
-    rough, rough_seen: coarse corners (`_coarse`), or arrays of no rows where every ray is to be cast.
-    """
-    work = _work_space(c, depth)
-    fine = True
-    even = np.zeros(I.shape[1] // BLOCK + 1, dtype=np.bool_)
-    for j in range(j_0, j_1):
-        J, y = j // BLOCK, (j % BLOCK) / BLOCK
-        if j == j_0 or y == 0:
-            for K in range(len(even)):
-                even[K] = rough.shape[0] > 0 and _even(rough, rough_seen, J, K)
-        w_y = (
-            -y * (y - 1) * (y - 2) / 6,
-            (y + 1) * (y - 1) * (y - 2) / 2,
-            -(y + 1) * y * (y - 2) / 2,
-            (y + 1) * y * (y - 1) / 6,
-        )
-        for i in range(I.shape[1]):
-            I[j, i], seen[j, i] = 1.0, 0
-            K = i // BLOCK
-            if even[K]:
-                x = (i % BLOCK) / BLOCK
-                w_x = (
-                    -x * (x - 1) * (x - 2) / 6,
-                    (x + 1) * (x - 1) * (x - 2) / 2,
-                    -(x + 1) * x * (x - 2) / 2,
-                    (x + 1) * x * (x - 1) / 6,
-                )
-                total = 0.0
-                for a in range(4):
-                    for b in range(4):
-                        total += w_y[a] * w_x[b] * rough[J - 1 + a, K - 1 + b]
-                I[j, i], seen[j, i] = total, rough_seen[J, K]
-            elif mask[j, i]:
-                I[j, i], seen[j, i] = _at(c, work, u_0 + i - 0.5, v_0 + j - 0.5)
-                if seen[j, i] < 0:
-                    fine = False
-    return fine
 
 
 @njit(cache=True, nogil=True)
@@ -255,7 +73,7 @@ def _crossing(c: Any, work: Any, u_0: float, v_0: float, u_1: float, v_1: float,
     lo, hi = 0.0, 1.0
     for _ in range(HALVINGS):
         x = 0.5 * (lo + hi)
-        _, here = _at(c, work, u_0 + x * (u_1 - u_0), v_0 + x * (v_1 - v_0))
+        _, here = at(c, work, u_0 + x * (u_1 - u_0), v_0 + x * (v_1 - v_0))
         if here == mark:
             lo = x
         else:
@@ -286,14 +104,14 @@ def _split_cell(
         for q in range(len(GAUSS)):
             y = y_0 + (y_1 - y_0) * GAUSS[q, 0]
             u, v = left + y * u_y, low + y * v_y
-            _, mark = _at(c, work, u, v)
-            _, other = _at(c, work, u + u_x, v + v_x)
+            _, mark = at(c, work, u, v)
+            _, other = at(c, work, u + u_x, v + v_x)
             edge = _crossing(c, work, u, v, u + u_x, v + v_x, mark) if mark != other else 0.5
             for side in range(2):
                 length = -edge if side == 0 else 1.0 - edge
                 for g in range(len(GAUSS)):
                     x = edge + length * GAUSS[g, 0] ** 2
-                    value, _ = _at(c, work, u + x * u_x, v + x * v_x)
+                    value, _ = at(c, work, u + x * u_x, v + x * v_x)
                     value *= 2 * GAUSS[g, 0] * GAUSS[g, 1] * abs(length) * GAUSS[q, 1] * (y_1 - y_0)
                     a, b = (x - 0.5, y - 0.5) if along_u else (y - 0.5, x - 0.5)
                     m += value
@@ -359,7 +177,7 @@ def _cells(
     rough: Any,
 ) -> None:
     """Add weight x moments of the f x f cells of the pixels in rows j_0 to j_1 to `out` (4, rows, columns)."""
-    work = _work_space(c, depth)
+    work = work_space(c, depth)
     node, node_seen = np.empty((f + 1, f + 1)), np.empty((f + 1, f + 1), dtype=np.int64)
     h = 1.0 / f
     fill_smooth(I, seen, f, j_0, j_1, weight, out, rough)
@@ -373,7 +191,7 @@ def _cells(
                     if a in (0, f) and b in (0, f):
                         node[a, b], node_seen[a, b] = I[j + a // f, i + b // f], seen[j + a // f, i + b // f]
                     else:
-                        node[a, b], node_seen[a, b] = _at(c, work, left + b * h, low + a * h)
+                        node[a, b], node_seen[a, b] = at(c, work, left + b * h, low + a * h)
             for a in range(f):
                 for b in range(f):
                     f_00, f_01, f_10, f_11 = node[a, b], node[a, b + 1], node[a + 1, b], node[a + 1, b + 1]
@@ -385,7 +203,7 @@ def _cells(
                         out[0, j * f + a, i * f + b] += weight
                         continue
                     corners = (f_00 + f_01 + f_10 + f_11) / 4
-                    middle, _ = _at(c, work, left + (b + 0.5) * h, low + (a + 0.5) * h)
+                    middle, _ = at(c, work, left + (b + 0.5) * h, low + (a + 0.5) * h)
                     span = max(f_00, f_01, f_10, f_11, middle) - min(f_00, f_01, f_10, f_11, middle)
                     if span < FLAT or (same and abs(middle - corners) < FLAT):
                         _add(
@@ -421,7 +239,7 @@ def _cells(
                     m = m_u = m_v = m_uv = 0.0
                     for q in range(n):
                         x, y = (q + 0.5) / n, (((q - n // 2) * step + n // 2) % n + 0.5) / n
-                        value, _ = _at(c, work, left + (b + x) * h, low + (a + y) * h)
+                        value, _ = at(c, work, left + (b + x) * h, low + (a + y) * h)
                         m += value
                         m_u += value * (x - 0.5)
                         m_v += value * (y - 0.5)
@@ -429,52 +247,6 @@ def _cells(
                     # Slopes per pixel of the least-squares bilinear surface: 12 / h times the first moments.
                     k = weight * 12 * f / n
                     _add(out, j * f + a, i * f + b, weight * m / n, k * m_u, k * m_v, k * 12 * f * m_uv)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Window:
-    """A rectangle of pixels: u from u_0 to u_0 + n_u, v likewise."""
-
-    u_0: int
-    v_0: int
-    n_u: int
-    n_v: int
-
-
-def shadow(
-    outlines: list[tuple[Frame, Array]],
-    view: View,
-    T_FW: dict[Frame, RigidTransform],
-    scanner: Scanner,
-    margin: int,
-) -> Window | None:
-    """The pixels that convex hulls of points (k, 3) in their frames can shade, with a margin, cut `margin` outside
-    the detector; None where there are none."""
-    boxes = shadow_boxes(outlines, view, T_FW)
-    lo, hi = np.floor(boxes[:, 0].min(axis=0)) - margin, np.ceil(boxes[:, 1].max(axis=0)) + margin
-    u_0, v_0 = max(int(lo[0]), -margin), max(int(lo[1]), -margin)
-    u_1, v_1 = min(int(hi[0]) + 1, scanner.n_u + margin), min(int(hi[1]) + 1, scanner.n_v + margin)
-    seen = u_1 > max(u_0, 0) and v_1 > max(v_0, 0) and u_0 < scanner.n_u and v_0 < scanner.n_v
-    return Window(u_0=u_0, v_0=v_0, n_u=u_1 - u_0, n_v=v_1 - v_0) if seen else None
-
-
-def enclosing(windows: list[Window | None]) -> Window | None:
-    """The smallest window that holds them all."""
-    some = [w for w in windows if w is not None]
-    if not some:
-        return None
-    u_0, v_0 = min(w.u_0 for w in some), min(w.v_0 for w in some)
-    u_1, v_1 = max(w.u_0 + w.n_u for w in some), max(w.v_0 + w.n_v for w in some)
-    return Window(u_0=u_0, v_0=v_0, n_u=u_1 - u_0, n_v=v_1 - v_0)
-
-
-def shadow_boxes(outlines: list[tuple[Frame, Array]], view: View, T_FW: dict[Frame, RigidTransform]) -> Array:
-    """(m, 2, 2): lowest and highest (u, v) of each outline."""
-    boxes = np.empty((len(outlines), 2, 2))
-    for k, (frame, corners) in enumerate(outlines):
-        x = view.project(T_FW[frame].apply(corners))
-        boxes[k] = x.min(axis=0), x.max(axis=0)
-    return boxes
 
 
 def _without_small_parts(compiled: Compiled, boxes: Array) -> bool:
@@ -533,10 +305,10 @@ def add_transmission(
     fine = [True]
     shape = (window.n_v // BLOCK + 1, window.n_u // BLOCK + 1) if _without_small_parts(compiled, boxes) else (0, 0)
     rough_I, rough_seen = np.empty(shape), np.empty(shape, dtype=np.int64)
-    in_bands(lambda lo, hi: _coarse(*common, mask, lo, hi, rough_I, rough_seen), shape[0], threads)
+    in_bands(lambda lo, hi: coarse_corners(*common, mask, lo, hi, rough_I, rough_seen), shape[0], threads)
 
     def corners(lo: int, hi: int) -> None:
-        if not _corners(*common, mask, rough_I, rough_seen, lo, hi, I, seen):
+        if not all_corners(*common, mask, rough_I, rough_seen, lo, hi, I, seen):
             fine[0] = False
 
     in_bands(corners, window.n_v + 1, threads)

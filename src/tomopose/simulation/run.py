@@ -24,11 +24,12 @@ from tomopose.simulation.gvxr import add_gvxr_transmission
 from tomopose.simulation.materials import MATERIALS, Material
 from tomopose.simulation.mesh import Mesh, MeshSolid
 from tomopose.simulation.mesh_projector import add_mesh_transmission
-from tomopose.simulation.projector import View, add_transmission, enclosing, shadow
+from tomopose.simulation.projector import add_transmission
 from tomopose.simulation.rays import Compiled, compile_solids
 from tomopose.simulation.shapes import Solid
 from tomopose.simulation.spectrum import Beam, Spectrum, condense, tube_spectrum
 from tomopose.simulation.spot import FocalSpot, Motion
+from tomopose.simulation.view import View, enclosing, shadow
 from tomopose.units import Array, float_array
 
 

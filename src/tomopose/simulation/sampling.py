@@ -1,0 +1,154 @@
+"""Transmission and signature of single rays, and of the rays through the pixels' corners."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from tomopose.simulation.rays import LARGEST, trace
+
+BLOCK = 4
+"""Between every fourth corner rays are interpolated where all around sees the same, smoothly."""
+EVEN = 5e-4
+"""Largest third difference of transmission over coarse corners that counts as smooth."""
+OPAQUE = 30.0
+"""exp(-30) = 1e-13: nothing gets through."""
+STEPS = 128
+DECAY = np.exp(-np.arange(OPAQUE * STEPS + 1) / STEPS)
+
+
+@njit(cache=True, nogil=True)
+def work_space(c: Any, depth: int) -> Any:
+    """(T, S, L, active) for `trace`: each band of rows has its own."""
+    mu, boxes = c[10], c[15]
+    return (
+        np.empty((depth + 3, LARGEST)),
+        np.empty((depth + 3, LARGEST + 1), dtype=np.int64),
+        np.empty(mu.shape[1]),
+        np.empty(len(boxes), dtype=np.bool_),
+    )
+
+
+@njit(cache=True, nogil=True)
+def at(c: Any, work: Any, u: float, v: float) -> Any:
+    """(transmission, signature) at pixel coordinates (u, v)."""
+    kind, p, R, t, ops, first, material, centre, radius, w, mu, s, O, U, V, boxes = c
+    T, S, L, active = work
+    nothing = True
+    for k in range(len(active)):
+        active[k] = boxes[k, 0, 0] <= u <= boxes[k, 1, 0] and boxes[k, 0, 1] <= v <= boxes[k, 1, 1]
+        nothing = nothing and not active[k]
+    if nothing:
+        return 1.0, np.int64(0)
+    dx, dy, dz = (
+        O[0] + u * U[0] + v * V[0] - s[0],
+        O[1] + u * U[1] + v * V[1] - s[1],
+        O[2] + u * U[2] + v * V[2] - s[2],
+    )
+    h = 1 / np.sqrt(dx * dx + dy * dy + dz * dz)
+    signature = trace(
+        kind, p, R, t, ops, first, material, centre, radius, active, s[0], s[1], s[2], h * dx, h * dy, h * dz, T, S, L
+    )
+    if signature == 0:
+        return 1.0, signature
+    total = 0.0
+    for e in range(len(w)):
+        x = 0.0
+        for m in range(len(L)):
+            x += mu[e, m] * L[m]
+        if x < OPAQUE:
+            # exp(-x) from a table and three terms of the series, to 2e-10.
+            k = int(x * STEPS)
+            r = x - k / STEPS
+            total += w[e] * DECAY[k] * (1 - r * (1 - r * (0.5 - r / 6)))
+    return total, signature
+
+
+@njit(cache=True, nogil=True)
+def coarse_corners(c: Any, depth: int, u_0: int, v_0: int, mask: Any, j_0: int, j_1: int, I: Any, seen: Any) -> None:
+    """Every BLOCK-th corner, rows j_0 to j_1 of them; seen is 0 where nothing is met, or less than may be met."""
+    work = work_space(c, depth)
+    for j in range(j_0, j_1):
+        for i in range(I.shape[1]):
+            I[j, i], seen[j, i] = 1.0, 0
+            if mask[BLOCK * j, BLOCK * i]:
+                I[j, i], seen[j, i] = at(c, work, u_0 + BLOCK * i - 0.5, v_0 + BLOCK * j - 0.5)
+                possible = 0
+                for k in range(len(work[3])):
+                    possible += work[3][k]
+                if possible != work[1][-1, -1]:
+                    seen[j, i] = 0
+
+
+@njit(cache=True, nogil=True)
+def _even(I: Any, seen: Any, j: int, i: int) -> bool:
+    """Whether cubic interpolation between coarse corners (j, i) and (j + 1, i + 1) stands for the rays there."""
+    if j < 1 or i < 1 or j + 2 >= I.shape[0] or i + 2 >= I.shape[1] or seen[j, i] == 0:
+        return False
+    for a in range(j - 1, j + 3):
+        for b in range(i - 1, i + 3):
+            if seen[a, b] != seen[j, i]:
+                return False
+        if abs(I[a, i - 1] - 3 * I[a, i] + 3 * I[a, i + 1] - I[a, i + 2]) > EVEN:
+            return False
+    largest = 0.0
+    for b in range(i - 1, i + 3):
+        largest = max(largest, abs(I[j - 1, b] - 3 * I[j, b] + 3 * I[j + 1, b] - I[j + 2, b]))
+    return largest <= EVEN
+
+
+@njit(cache=True, nogil=True)
+def all_corners(
+    c: Any,
+    depth: int,
+    u_0: int,
+    v_0: int,
+    mask: Any,
+    rough: Any,
+    rough_seen: Any,
+    j_0: int,
+    j_1: int,
+    I: Any,
+    seen: Any,
+) -> bool:
+    """Transmission and signature at the pixels' corners, rows j_0 to j_1; False where a list overflowed.
+
+    rough, rough_seen: coarse corners (`coarse_corners`), or arrays of no rows where every ray is to be cast.
+    """
+    work = work_space(c, depth)
+    fine = True
+    even = np.zeros(I.shape[1] // BLOCK + 1, dtype=np.bool_)
+    for j in range(j_0, j_1):
+        J, y = j // BLOCK, (j % BLOCK) / BLOCK
+        if j == j_0 or y == 0:
+            for K in range(len(even)):
+                even[K] = rough.shape[0] > 0 and _even(rough, rough_seen, J, K)
+        w_y = (
+            -y * (y - 1) * (y - 2) / 6,
+            (y + 1) * (y - 1) * (y - 2) / 2,
+            -(y + 1) * y * (y - 2) / 2,
+            (y + 1) * y * (y - 1) / 6,
+        )
+        for i in range(I.shape[1]):
+            I[j, i], seen[j, i] = 1.0, 0
+            K = i // BLOCK
+            if even[K]:
+                x = (i % BLOCK) / BLOCK
+                w_x = (
+                    -x * (x - 1) * (x - 2) / 6,
+                    (x + 1) * (x - 1) * (x - 2) / 2,
+                    -(x + 1) * x * (x - 2) / 2,
+                    (x + 1) * x * (x - 1) / 6,
+                )
+                total = 0.0
+                for a in range(4):
+                    for b in range(4):
+                        total += w_y[a] * w_x[b] * rough[J - 1 + a, K - 1 + b]
+                I[j, i], seen[j, i] = total, rough_seen[J, K]
+            elif mask[j, i]:
+                I[j, i], seen[j, i] = at(c, work, u_0 + i - 0.5, v_0 + j - 0.5)
+                if seen[j, i] < 0:
+                    fine = False
+    return fine
