@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from tomopose.detection.cholesky import solve
-from tomopose.detection.cone import cone_angle, cone_coordinates, ring_pixels
-from tomopose.detection.edges import FIRST_NODE, N_SHAPE, SHAPE, WHITE, influence, model_rows, normal_equations
+from tomopose.detection.cone import ring_pixels
+from tomopose.detection.edges import FIRST_NODE, N_SHAPE, SHAPE, influence
 from tomopose.detection.noise import correlation, sandwich, sector_median
-from tomopose.detection.profile import edge_profile
+from tomopose.detection.rim import Rim
 from tomopose.errors import BallNotFoundError
 from tomopose.geometry.scanner import Scanner
 from tomopose.units import Array
@@ -29,11 +29,6 @@ GROSS = 0.1
 """Share of the contrast from which a residual can spoil a least-squares start."""
 MISFIT = 6.0
 """Standard deviations by which a sector's chi-square must exceed 1 for its background to count as badly fitted."""
-MANY, NEAR = 8000, 8.0
-"""Of more pixels than this, every second one is left out that lies farther than NEAR px outside the rim."""
-LINEAR = 0.02
-"""Largest move, px, after which distances are updated to first order: what is left out is LINEAR^2 / 2 radius."""
-SMALLEST_BLUR, LARGEST_STEP = 0.25, 2.0
 STEEPEST = 6.0
 """Prior: the background changes over the ring by no more than this many standard deviations of the ring's values."""
 KAPPA_STARTS = (0.3, 1.0, 3.0, 8.0)
@@ -76,144 +71,6 @@ class ConeFit:
         return abs(self.level - self.white) / self.noise_out
 
 
-class _Rim:
-    """Pixels of the ring, parameters, and the normal equations at the current parameters."""
-
-    def __init__(
-        self, window: Array, good: Array, origin: tuple[int, int], scanner: Scanner, x_D: Array, radius: float
-    ) -> None:
-        self.window, self.good, self.origin, self.scanner = window, good, origin, scanner
-        self.inverse_K = np.linalg.inv(scanner.K)
-        self.p = math.sqrt(scanner.p_u * scanner.p_v)
-        self.gamma_px = cone_angle(scanner, x_D, 1.0)
-        self.shape = np.array([x_D[0], x_D[1], radius, 0.8, np.inf, 0.0, 0.0])
-        self.n_nodes = int(np.clip(round(2 * math.pi * radius / 9.5), 6, 36))
-        self.nodes, self.white = np.zeros((self.n_nodes, 3)), 0.0
-        self.reach = float(np.clip(0.35 * radius, 5.0, 22.0))
-        self.outside = min(self.reach, 6.0)
-        self.inside = float(min(5.0, radius - 0.5))
-        box = np.array([scanner.p_u, scanner.p_v]) ** 2 / (12 * self.p**2)
-        self.box_u, self.box_v = box - box.mean()
-        self.precision = np.zeros(3 * self.n_nodes)
-        self.kappa_start, self.white_prior = 1.0, (0.0, 0.0)
-        self.gather()
-
-    def gather(self) -> None:
-        """Takes the pixels of the ring about the current silhouette."""
-        u_c, v_c, radius = self.shape[:3]
-        margin = 3.0 + 0.05 * radius
-        u, v, value = ring_pixels(
-            self.window, self.good, self.origin[0], self.origin[1], u_c, v_c, radius - self.inside - margin,
-            radius + self.outside + margin, self.scanner.p_u / self.p, self.scanner.p_v / self.p,
-        )  # fmt: skip
-        rim = self.coordinates(u, v)
-        wanted = (rim[:, 0] > -self.inside) & (rim[:, 0] < self.outside)
-        if u.size > MANY:
-            wanted &= (rim[:, 0] < NEAR) | ((u + v) % 2 == 0)
-        keep = np.flatnonzero(wanted)
-        # Neighbours in angle lie together in memory: the blocks of the normal matrix then stay in the nearest cache.
-        keep = keep[np.argsort(np.floor(np.arctan2(rim[keep, 5], rim[keep, 4]) * self.n_nodes), kind="stable")]
-        self.u, self.v, self.value = u[keep], v[keep], value[keep]
-        if self.u.size < 4 * self.n_nodes:
-            raise BallNotFoundError(f"only {self.u.size} usable pixels round the rim at ({u_c:.1f}, {v_c:.1f})")
-        n = self.u.size
-        self.model, self.jacobian = np.zeros(n), np.zeros((n, 14))
-        self.left, self.share = np.zeros(n, np.int64), np.zeros(n)
-        self.weight = np.ones(n)
-        self.rim = np.ascontiguousarray(rim[keep])
-
-    def coordinates(self, u: Array, v: Array) -> Array:
-        s = self.shape
-        return np.asarray(
-            cone_coordinates(u, v, self.inverse_K, self.scanner.p_u, self.scanner.p_v, s[0], s[1], s[2] * self.gamma_px)
-        )
-
-    def evaluate(self, delta: Array | None = None) -> None:
-        """Model and Jacobian; after a small move `delta` of centre and radius the distances follow to first order."""
-        s = self.shape
-        if delta is None or np.abs(delta).max() > LINEAR:
-            self.rim = self.coordinates(self.u, self.v)
-        else:
-            self.rim[:, 0] += (
-                self.rim[:, 1] * delta[0] + self.rim[:, 2] * delta[1] + self.rim[:, 3] * (delta[2] * self.gamma_px)
-            )
-        table, first, step = edge_profile(s[3], s[4], s[2], -self.inside - 4.0, self.outside + 4.0)
-        model_rows(
-            self.rim, self.nodes, self.white, table, first, step, s[3], self.gamma_px, self.box_u, self.box_v, s[5],
-            s[6], self.model, self.jacobian, self.left, self.share,
-        )  # fmt: skip
-
-    @property
-    def residual(self) -> Array:
-        return self.value - self.model
-
-    def normal(self, active: npt.NDArray[np.intp]) -> tuple[Array, Array]:
-        """Normal matrix and right side of the active parameters, priors included."""
-        N, g = normal_equations(self.value, self.model, self.jacobian, self.left, self.weight, self.n_nodes)
-        if math.isfinite(self.shape[4]):
-            N[4, 4] += 1.0 / self.kappa_start**2
-            g[4] -= (self.shape[4] - self.kappa_start) / self.kappa_start**2
-        N[WHITE, WHITE] += self.white_prior[1]
-        g[WHITE] -= self.white_prior[1] * (self.white - self.white_prior[0])
-        i = np.arange(FIRST_NODE, FIRST_NODE + 3 * self.n_nodes)
-        centre = np.zeros_like(self.nodes)
-        centre[:, 0] = np.mean(self.nodes[:, 0])
-        N[i, i] += self.precision
-        g[i] -= self.precision * (self.nodes - centre).ravel()
-        return N[np.ix_(active, active)], g[active]
-
-    def step(self, active: npt.NDArray[np.intp], *, careful: bool = False) -> float:
-        """One Gauss-Newton step, shortened while it makes the fit worse if `careful`.
-
-        Returns the largest move of centre and radius, px.
-        """
-        N, g = self.normal(active)
-        delta = solve(N, g[:, None])[:, 0]
-        full = np.zeros(FIRST_NODE + 3 * self.n_nodes)
-        full[active] = delta
-        largest = float(np.abs(full[:3]).max())
-        if largest > LARGEST_STEP:
-            full[:N_SHAPE] *= LARGEST_STEP / largest
-        if not np.isfinite(full).all():
-            raise BallNotFoundError("the rim does not determine a ball (no finite step)")
-        before = (self.shape, self.white, self.nodes)
-        cost = self.cost
-        self._move(full, active)
-        while careful and self.cost > cost and np.abs(full[:3]).max() > 1e-3:
-            full = full / 3
-            self.shape, self.white, self.nodes = before
-            self._move(full, active)
-        return largest
-
-    @property
-    def cost(self) -> float:
-        return float((self.weight * self.residual**2).sum())
-
-    def _move(self, full: Array, active: npt.NDArray[np.intp]) -> None:
-        """Adds `full` to the parameters, within their bounds."""
-        s = self.shape.copy()
-        s[active[active < N_SHAPE]] += full[active[active < N_SHAPE]]
-        s[3] = np.clip(s[3], max(SMALLEST_BLUR, self.shape[3] / 2), min(self.shape[3] * 2, 0.45 * s[2]))
-        if math.isfinite(s[4]):
-            s[4] = np.clip(s[4], max(self.shape[4] / 2, 0.1), min(self.shape[4] * 2, 20.0))
-        self.shape = s
-        self.white += full[WHITE]
-        self.nodes = self.nodes + full[FIRST_NODE:].reshape(-1, 3)
-        self.evaluate(full[:3])
-
-    def active(self, *shape: str, curvature: bool = True) -> npt.NDArray[np.intp]:
-        use = np.zeros(FIRST_NODE + 3 * self.n_nodes, dtype=bool)
-        use[[SHAPE.index(name) for name in shape]] = True
-        use[WHITE:] = True
-        if not curvature:
-            use[FIRST_NODE + 2 :: 3] = False
-        return np.flatnonzero(use)
-
-    @property
-    def level(self) -> float:
-        return float(np.mean(self.nodes[:, 0]))
-
-
 def fit_cone(
     window: Array,
     good: Array,
@@ -237,7 +94,7 @@ def fit_cone(
     ------
     BallNotFoundError  where no ball can be fitted there.
     """
-    rim = _Rim(window, good, origin, scanner, np.asarray(x_D, dtype=np.float64), radius)
+    rim = Rim(window, good, origin, scanner, np.asarray(x_D, dtype=np.float64), radius)
     spread = float(np.std(rim.value))
     if not spread > 0:
         raise BallNotFoundError(f"the image is constant around ({x_D[0]:.1f}, {x_D[1]:.1f})")
@@ -278,7 +135,7 @@ def fit_cone(
     return _result(rim, shape, active, (v_in, v_out), excess, anisotropy, anisotropy_covariance)
 
 
-def _approach(rim: _Rim, spread: float) -> None:
+def _approach(rim: Rim, spread: float) -> None:
     """From the finder's circle to the neighbourhood of the optimum, without curvature and with equal weights."""
     rim.weight = np.full(rim.u.size, 1.0 / (0.03 * spread) ** 2)
     prior = np.zeros((rim.n_nodes, 3))
@@ -300,7 +157,7 @@ def _approach(rim: _Rim, spread: float) -> None:
         rim.weight = np.where(out, 0.0, 1.0 / (0.03 * spread) ** 2)
 
 
-def _robust_background(rim: _Rim, spread: float) -> None:
+def _robust_background(rim: Rim, spread: float) -> None:
     """The background over the whole ring; dead lines and hot pixels, if there are any, get little weight (Cauchy)."""
     equal = np.full(rim.u.size, 1.0 / (0.03 * spread) ** 2)
     rim.weight = equal
@@ -317,7 +174,7 @@ def _robust_background(rim: _Rim, spread: float) -> None:
         rim.step(active)
 
 
-def _is_transparent(rim: _Rim) -> bool:
+def _is_transparent(rim: Rim) -> bool:
     """Whether the ball grows darker towards its middle by more than noise and 1 % of its contrast."""
     depth = 3 * rim.shape[3] + 0.5
     radius = rim.shape[2]
@@ -338,7 +195,7 @@ def _is_transparent(rim: _Rim) -> bool:
     return abs(near - deep) > max(0.01 * abs(rim.level - deep), 6 * math.hypot(u_near, u_deep))
 
 
-def _choose_kappa(rim: _Rim, spread: float, start: Array) -> None:
+def _choose_kappa(rim: Rim, spread: float, start: Array) -> None:
     """Widens the ring inwards and takes the best of several starts for the total attenuation."""
     radius = start[2]
     rim.shape = start.copy()
@@ -360,7 +217,7 @@ def _choose_kappa(rim: _Rim, spread: float, start: Array) -> None:
     rim.evaluate()
 
 
-def _weigh(rim: _Rim, floor: float, parameters: float) -> tuple[float, float, Array]:
+def _weigh(rim: Rim, floor: float, parameters: float) -> tuple[float, float, Array]:
     """Noise at the ball's and the background's level, single outliers dropped, how badly sectors fit.
 
     The noise is the median over the sectors round the rim, so that a holder's edge that no smooth background follows
@@ -391,7 +248,7 @@ def _weigh(rim: _Rim, floor: float, parameters: float) -> tuple[float, float, Ar
     return v_in, v_out, (chi2 - 1.0) / np.sqrt(2.0 / np.maximum(n_k, 1))
 
 
-def _curvature_precision(rim: _Rim, active: npt.NDArray[np.intp]) -> Array:
+def _curvature_precision(rim: Rim, active: npt.NDArray[np.intp]) -> Array:
     """Empirical Bayes: 1 / tau_k^2 with tau_k^2 what the estimated curvature shows above its own variance."""
     kept, rim.precision = rim.precision, rim.precision.copy()
     rim.precision[2::3] = 0.0
@@ -406,7 +263,7 @@ def _curvature_precision(rim: _Rim, active: npt.NDArray[np.intp]) -> Array:
     return np.where(V > 0, 1.0 / np.maximum(np.maximum(smooth, 1e-3 * V), 1e-300), 0.0)
 
 
-def _anisotropy(rim: _Rim, shape: tuple[str, ...]) -> tuple[Array, Array]:
+def _anisotropy(rim: Rim, shape: tuple[str, ...]) -> tuple[Array, Array]:
     """One Gauss-Newton step towards a blur that depends on direction, and its covariance, px^2."""
     active = rim.active(*shape, "q_cos", "q_sin")
     N, g = rim.normal(active)
@@ -419,7 +276,7 @@ def _anisotropy(rim: _Rim, shape: tuple[str, ...]) -> tuple[Array, Array]:
 
 
 def _result(
-    rim: _Rim,
+    rim: Rim,
     shape: tuple[str, ...],
     active: npt.NDArray[np.intp],
     variances: tuple[float, float],
@@ -472,14 +329,14 @@ def _result(
     )
 
 
-def _scattered(rim: _Rim, active: npt.NDArray[np.intp], rows: Array) -> Array:
+def _scattered(rim: Rim, active: npt.NDArray[np.intp], rows: Array) -> Array:
     """Rows of the inverse normal matrix (m, active) in the order of all parameters, zero where one was not fitted."""
     full = np.zeros((rows.shape[0], FIRST_NODE + 3 * rim.n_nodes))
     full[:, active] = rows
     return full
 
 
-def _rim_shares(rim: _Rim) -> tuple[float, float]:
+def _rim_shares(rim: Rim) -> tuple[float, float]:
     """Share of the rim's directions with a pixel in the image, and share of the rim's pixels that were left out."""
     radius, half = rim.shape[2], max(1.5, 2 * rim.shape[3])
     u, v, _ = ring_pixels(

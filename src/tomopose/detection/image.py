@@ -22,7 +22,7 @@ NATIVE = ("uint8", "uint16", "float32", "float64")
 SMALLEST_IMAGE = 16
 WORST_SIGMA = 0.5
 """A centre less certain than this, px, is no measurement."""
-WORST_RIM = 0.1
+WORST_RIM = 0.3
 """Residual on the rim, in contrasts, of what still counts as a ball."""
 REGION_MARGIN, REGION_REACH = 24.0, 1.5
 """A region about a predicted position reaches this many radii plus this margin, px."""

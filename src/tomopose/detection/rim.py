@@ -1,0 +1,160 @@
+"""The ring of pixels about a rim, the fit's parameters, and one Gauss-Newton step."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from tomopose.detection.cholesky import solve
+from tomopose.detection.cone import cone_angle, cone_coordinates, ring_pixels
+from tomopose.detection.edges import FIRST_NODE, N_SHAPE, SHAPE, WHITE, model_rows, normal_equations
+from tomopose.detection.profile import edge_profile
+from tomopose.errors import BallNotFoundError
+from tomopose.geometry.scanner import Scanner
+from tomopose.units import Array
+
+MANY, NEAR = 8000, 8.0
+"""Of more pixels than this, every second one is left out that lies farther than NEAR px outside the rim."""
+LINEAR = 0.02
+"""Largest move, px, after which distances are updated to first order: what is left out is LINEAR^2 / 2 radius."""
+SMALLEST_BLUR, LARGEST_STEP = 0.25, 2.0
+
+
+class Rim:
+    """Pixels of the ring, parameters, and the normal equations at the current parameters."""
+
+    def __init__(
+        self, window: Array, good: Array, origin: tuple[int, int], scanner: Scanner, x_D: Array, radius: float
+    ) -> None:
+        self.window, self.good, self.origin, self.scanner = window, good, origin, scanner
+        self.inverse_K = np.linalg.inv(scanner.K)
+        self.p = math.sqrt(scanner.p_u * scanner.p_v)
+        self.gamma_px = cone_angle(scanner, x_D, 1.0)
+        self.shape = np.array([x_D[0], x_D[1], radius, 0.8, np.inf, 0.0, 0.0])
+        self.n_nodes = int(np.clip(round(2 * math.pi * radius / 9.5), 6, 36))
+        self.nodes, self.white = np.zeros((self.n_nodes, 3)), 0.0
+        self.reach = float(np.clip(0.35 * radius, 5.0, 22.0))
+        self.outside = min(self.reach, 6.0)
+        self.inside = float(min(5.0, radius - 0.5))
+        box = np.array([scanner.p_u, scanner.p_v]) ** 2 / (12 * self.p**2)
+        self.box_u, self.box_v = box - box.mean()
+        self.precision = np.zeros(3 * self.n_nodes)
+        self.kappa_start, self.white_prior = 1.0, (0.0, 0.0)
+        self.gather()
+
+    def gather(self) -> None:
+        """Takes the pixels of the ring about the current silhouette."""
+        u_c, v_c, radius = self.shape[:3]
+        margin = 3.0 + 0.05 * radius
+        u, v, value = ring_pixels(
+            self.window, self.good, self.origin[0], self.origin[1], u_c, v_c, radius - self.inside - margin,
+            radius + self.outside + margin, self.scanner.p_u / self.p, self.scanner.p_v / self.p,
+        )  # fmt: skip
+        rim = self.coordinates(u, v)
+        wanted = (rim[:, 0] > -self.inside) & (rim[:, 0] < self.outside)
+        if u.size > MANY:
+            wanted &= (rim[:, 0] < NEAR) | ((u + v) % 2 == 0)
+        keep = np.flatnonzero(wanted)
+        # Neighbours in angle lie together in memory: the blocks of the normal matrix then stay in the nearest cache.
+        keep = keep[np.argsort(np.floor(np.arctan2(rim[keep, 5], rim[keep, 4]) * self.n_nodes), kind="stable")]
+        self.u, self.v, self.value = u[keep], v[keep], value[keep]
+        if self.u.size < 4 * self.n_nodes:
+            raise BallNotFoundError(f"only {self.u.size} usable pixels round the rim at ({u_c:.1f}, {v_c:.1f})")
+        n = self.u.size
+        self.model, self.jacobian = np.zeros(n), np.zeros((n, 14))
+        self.left, self.share = np.zeros(n, np.int64), np.zeros(n)
+        self.weight = np.ones(n)
+        self.rim = np.ascontiguousarray(rim[keep])
+
+    def coordinates(self, u: Array, v: Array) -> Array:
+        s = self.shape
+        return np.asarray(
+            cone_coordinates(u, v, self.inverse_K, self.scanner.p_u, self.scanner.p_v, s[0], s[1], s[2] * self.gamma_px)
+        )
+
+    def evaluate(self, delta: Array | None = None) -> None:
+        """Model and Jacobian; after a small move `delta` of centre and radius the distances follow to first order."""
+        s = self.shape
+        if delta is None or np.abs(delta).max() > LINEAR:
+            self.rim = self.coordinates(self.u, self.v)
+        else:
+            self.rim[:, 0] += (
+                self.rim[:, 1] * delta[0] + self.rim[:, 2] * delta[1] + self.rim[:, 3] * (delta[2] * self.gamma_px)
+            )
+        table, first, step = edge_profile(s[3], s[4], s[2], -self.inside - 4.0, self.outside + 4.0)
+        model_rows(
+            self.rim, self.nodes, self.white, table, first, step, s[3], self.gamma_px, self.box_u, self.box_v, s[5],
+            s[6], self.model, self.jacobian, self.left, self.share,
+        )  # fmt: skip
+
+    @property
+    def residual(self) -> Array:
+        return self.value - self.model
+
+    def normal(self, active: npt.NDArray[np.intp]) -> tuple[Array, Array]:
+        """Normal matrix and right side of the active parameters, priors included."""
+        N, g = normal_equations(self.value, self.model, self.jacobian, self.left, self.weight, self.n_nodes)
+        if math.isfinite(self.shape[4]):
+            N[4, 4] += 1.0 / self.kappa_start**2
+            g[4] -= (self.shape[4] - self.kappa_start) / self.kappa_start**2
+        N[WHITE, WHITE] += self.white_prior[1]
+        g[WHITE] -= self.white_prior[1] * (self.white - self.white_prior[0])
+        i = np.arange(FIRST_NODE, FIRST_NODE + 3 * self.n_nodes)
+        centre = np.zeros_like(self.nodes)
+        centre[:, 0] = np.mean(self.nodes[:, 0])
+        N[i, i] += self.precision
+        g[i] -= self.precision * (self.nodes - centre).ravel()
+        return N[np.ix_(active, active)], g[active]
+
+    def step(self, active: npt.NDArray[np.intp], *, careful: bool = False) -> float:
+        """One Gauss-Newton step, shortened while it makes the fit worse if `careful`.
+
+        Returns the largest move of centre and radius, px.
+        """
+        N, g = self.normal(active)
+        delta = solve(N, g[:, None])[:, 0]
+        full = np.zeros(FIRST_NODE + 3 * self.n_nodes)
+        full[active] = delta
+        largest = float(np.abs(full[:3]).max())
+        if largest > LARGEST_STEP:
+            full[:N_SHAPE] *= LARGEST_STEP / largest
+        if not np.isfinite(full).all():
+            raise BallNotFoundError("the rim does not determine a ball (no finite step)")
+        before = (self.shape, self.white, self.nodes)
+        cost = self.cost
+        self._move(full, active)
+        while careful and self.cost > cost and np.abs(full[:3]).max() > 1e-3:
+            full = full / 3
+            self.shape, self.white, self.nodes = before
+            self._move(full, active)
+        return largest
+
+    @property
+    def cost(self) -> float:
+        return float((self.weight * self.residual**2).sum())
+
+    def _move(self, full: Array, active: npt.NDArray[np.intp]) -> None:
+        """Adds `full` to the parameters, within their bounds."""
+        s = self.shape.copy()
+        s[active[active < N_SHAPE]] += full[active[active < N_SHAPE]]
+        s[3] = np.clip(s[3], max(SMALLEST_BLUR, self.shape[3] / 2), min(self.shape[3] * 2, 0.45 * s[2]))
+        if math.isfinite(s[4]):
+            s[4] = np.clip(s[4], max(self.shape[4] / 2, 0.1), min(self.shape[4] * 2, 20.0))
+        self.shape = s
+        self.white += full[WHITE]
+        self.nodes = self.nodes + full[FIRST_NODE:].reshape(-1, 3)
+        self.evaluate(full[:3])
+
+    def active(self, *shape: str, curvature: bool = True) -> npt.NDArray[np.intp]:
+        use = np.zeros(FIRST_NODE + 3 * self.n_nodes, dtype=bool)
+        use[[SHAPE.index(name) for name in shape]] = True
+        use[WHITE:] = True
+        if not curvature:
+            use[FIRST_NODE + 2 :: 3] = False
+        return np.flatnonzero(use)
+
+    @property
+    def level(self) -> float:
+        return float(np.mean(self.nodes[:, 0]))
