@@ -38,6 +38,7 @@ DETECTION_PX = PRINTED[5.3, 3][1]
 BALL = ((3.0, -2.0, 5.0),)
 TWO_BALLS = ((12.0, -14.0, 10.0), (-10.0, 12.0, -15.0))
 ROBOT_BALLS = ((20.0, -15.0, 60.0), (-22.0, 10.0, 20.0))
+DISTANCE_U_MM = 0.0005
 QUARTERS = tuple(np.radians([0.0, 90.0, 180.0, 270.0]))
 SEEDS = {"small": 1, "paper": 5}
 SCAN_VIEWS = 180
@@ -61,7 +62,7 @@ NOTES = (
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
     """A machine with errors p, what is believed of it, its poses and scan, mount and balls (k, 3) in M; centre: middle
-    of the object in M, mm."""
+    of the object in M, mm; distances: between balls, known with a standard uncertainty, mm."""
 
     machine: Any
     believed: Any
@@ -71,6 +72,7 @@ class Experiment:
     T_HT: RigidTransform
     balls: Array
     centre: Array
+    distances: Mapping[tuple[int, int], tuple[float, float]] | None = None
 
 
 def mixed_poses(rng: np.random.Generator, *, balls: int = 1, n: int = 189) -> PoseSequence:
@@ -97,7 +99,8 @@ def hexapod_experiment(poses: Callable[[np.random.Generator], PoseSequence], bal
 
 
 def robot_experiment(rng: np.random.Generator, *, n: int = 200) -> Experiment:
-    """A 6R robot holds the object and turns it: n poses around the working one, two balls; a tilted turn of 330 deg."""
+    """A 6R robot holds the object and turns it: n poses around the working one, two balls of known
+    distance; a tilted turn of 330 deg."""
     robot = typical_robot()
     home = robot.forward(robot.q_start[None])
     mount = RigidTransform.from_angles([0.01, -0.02, np.pi], np.zeros(3), source=Frame.H, target=Frame.T)
@@ -113,6 +116,7 @@ def robot_experiment(rng: np.random.Generator, *, n: int = 200) -> Experiment:
         poses=poses_at(turns, rng.uniform(-12, 12, (n, 3)), ball_id=np.arange(n) % 2, alpha=np.zeros(n)),
         scan=poses_at(R_z(angle) @ R_y(np.radians(8) * np.sin(7 * angle)), np.zeros((SCAN_VIEWS, 3))),
         T_HT=replace(mount, t=-(mount.R @ home.t[0])), balls=np.array(ROBOT_BALLS), centre=np.array([0.0, 0.0, 40.0]),
+        distances={(0, 1): (float(np.linalg.norm(np.subtract(*ROBOT_BALLS))), DISTANCE_U_MM)},
     )
 
 
@@ -121,7 +125,7 @@ CASES: Mapping[str, Callable[[np.random.Generator], Experiment]] = MappingProxyT
         "error correction, the paper's 189 poses": hexapod_experiment(lambda rng: pose_grid(3), BALL),
         "error correction, 189 mixed poses at four table angles": hexapod_experiment(mixed_poses, BALL),
         "the same with two balls": hexapod_experiment(lambda rng: mixed_poses(rng, balls=2), TWO_BALLS),
-        "6R robot arm, 200 poses, two balls": robot_experiment,
+        "6R robot arm, 200 poses, two balls of known distance": robot_experiment,
     }
 )
 
@@ -145,7 +149,8 @@ def solve_case(name: str, seed: int) -> dict[str, Any]:
     e, scanner = CASES[name](rng), paper_scanner()
     seen = observe(e, rng)
     rigid = calibrate(scanner, e.poses, seen, model="rigid", hypotheses=False, raise_on_failure=False)
-    best = calibrate_kinematic(scanner, e.poses, seen, rigid=rigid, manipulator=e.believed, model="kinematic")
+    best = calibrate_kinematic(scanner, e.poses, seen, rigid=rigid, manipulator=e.believed, model="kinematic",
+                               distances=e.distances)
     truth = real_motion(e.machine, e.scan, e.p)
     P_true = eq5_matrices(scanner, T_HT=e.T_HT, T_MH=truth.T_MH, alpha=alpha_of(e.scan))
     points = (scanner.T_TW(0.0) @ e.T_HT).apply(e.centre + object_points())
