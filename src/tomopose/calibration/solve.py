@@ -180,6 +180,7 @@ def calibrate(
     robust: bool = True,
     hypotheses: bool = True,
     pose_noise: Any = "auto",
+    distances: Mapping[tuple[int, int], tuple[float, float]] | None = None,
     raise_on_failure: bool = True,
 ) -> Calibration:
     """Find T_HT and t from radiographs of one ball.  Eq. (7), in one step, from no start value.
@@ -199,6 +200,8 @@ def calibrate(
     hypotheses:   try the cheap rival conventions and say so in the verdict.
     pose_noise:   scatter of the manipulator about the poses it reports: "auto" estimates it where the residuals are
                   significantly above what the centres' covariances explain; (mm, rad) states it; None has none.
+    distances:    (ball id, ball id) -> (distance, standard uncertainty), mm: scale bars.  With them the balls are
+                  solved for by the estimator of the manipulator's errors, so model must not be "rigid".
     raise_on_failure: raise where no optimum was reached; otherwise the status says so.
 
     Raises
@@ -211,6 +214,8 @@ def calibrate(
         raise InputError(f"unknown model {model!r}; known are {', '.join(MODELS)}")
     if model == "kinematic" and manipulator is None:
         raise InputError("model 'kinematic' needs the manipulator's nominal geometry (--manipulator FILE)")
+    if distances and (model == "rigid" or (model == "auto" and manipulator is None)):
+        raise InputError("distances between balls serve models with the manipulator's errors; give its geometry")
     problem = pair(scanner, poses, observations)
     freed = free_parameters(problem.scanners, free=free, fix=fix, priors=priors)
     stated = solve(problem, freed, robust=robust)
@@ -232,5 +237,6 @@ def calibrate(
     from tomopose.calibration.kinematic import calibrate_kinematic
 
     return calibrate_kinematic(
-        scanner, poses, observations, manipulator=manipulator, model=model, rigid=rigid, robust=robust
+        scanner, poses, observations, manipulator=manipulator, model=model, rigid=rigid, free=freed,
+        distances=distances, robust=robust,
     )

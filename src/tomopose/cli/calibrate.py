@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -30,9 +31,22 @@ from tomopose.cli.common import (
 
 EPILOG = "Example: tomopose calibrate --scanner scanner.json --poses poses.csv --images radiographs/ --out cal/"
 
+SCALE_BAR = re.compile(r"(?P<a>\d+),(?P<b>\d+)=(?P<mm>\d+\.?\d*)\((?P<u>\d*\.?\d+)\)")
+
 
 def register(app: typer.Typer) -> None:
     app.command("calibrate", epilog=EPILOG)(calibrate)
+
+
+def scale_bars(texts: list[str] | None) -> dict[tuple[int, int], tuple[float, float]] | None:
+    """`0,1=25.0000(0.0005)` as {(0, 1): (25.0, 0.0005)}, mm."""
+    bars = {}
+    for text in texts or ():
+        found = SCALE_BAR.fullmatch(text.replace(" ", ""))
+        if not found:
+            raise typer.BadParameter(f"{text!r} is not ID,ID=MM(U)", param_hint="--distance")
+        bars[int(found["a"]), int(found["b"])] = float(found["mm"]), float(found["u"])
+    return bars or None
 
 
 def calibrate(
@@ -53,6 +67,10 @@ def calibrate(
     ] = None,
     fix: Annotated[
         str | None, typer.Option("--fix", help="Parameters to hold although scanner.json gives them a sigma.")
+    ] = None,
+    distance: Annotated[
+        list[str] | None,
+        typer.Option("--distance", help="Scale bar between two balls, ID,ID=MM(U), as in 0,1=25.000(0.001)."),
     ] = None,
     dark: DarkOption = None,
     flat: FlatOption = None,
@@ -85,8 +103,11 @@ def calibrate(
     either(images, observations)
     say = Say(json=as_json, quiet=quiet)
     require_free_folder(out, force=force)
-    geometry, sequence = tp.read_scanner(scanner), tp.read_poses(poses)
+    bars = scale_bars(distance)
+    geometry = tp.read_scanner(scanner)
     errors = None if manipulator is None else tp.read_manipulator(manipulator)
+    # A table of joint values alone becomes poses by the robot's own kinematics.
+    sequence = tp.read_poses(poses, forward=getattr(errors, "forward", None) if hasattr(errors, "joints") else None)
     stack = None
     if observations is not None:
         observed = tp.read_observations(observations)
@@ -97,12 +118,13 @@ def calibrate(
         )
         observed = observe(say, geometry, stack, sequence, ball_diameter=ball_diameter, workers=workers)
     result = tp.calibrate(
-        geometry, sequence, observed, manipulator=errors, model=model, free=names(free), fix=names(fix)
+        geometry, sequence, observed, manipulator=errors, model=model, free=names(free), fix=names(fix),
+        distances=bars,
     )
     given = [scanner, poses, *(p for p in (observations, manipulator) if p is not None)]
     made = provenance(
         inputs=given,
-        arguments=arguments(model=model, free=free, fix=fix, ball_diameter_mm=ball_diameter,
+        arguments=arguments(model=model, free=free, fix=fix, distance=distance, ball_diameter_mm=ball_diameter,
                             images=None if images is None else len(observed)),
     )
     result = replace(result, provenance=made)

@@ -144,8 +144,12 @@ def write_calibration_folder(
 
 def calibration_summary(calibration: Calibration) -> tuple[dict[str, Any], list[str]]:
     """The figures of a calibration, for programs and for people."""
+    from tomopose.calibration.parameters import UNITS as units
     from tomopose.units import value_with_uncertainty
 
+    # The mount, the balls and the scanner are a dozen numbers; a manipulator's errors would drown them.
+    shown = [p for p in calibration.parameters if p.name.startswith(("phi_HT", "t_HT", "t_", "t[")) or p.name in units]
+    more = len(calibration.parameters) - len(shown)
     summary = {
         "verdict": calibration.verdict,
         "reasons": list(calibration.reasons),
@@ -164,7 +168,8 @@ def calibration_summary(calibration: Calibration) -> tuple[dict[str, Any], list[
         *(f"  - {reason}" for reason in calibration.reasons),
         f"  d_rms {calibration.d_rms:.4g} px ({calibration.d_rms_um:.3g} um at the object), "
         f"{len(calibration.pose_id)} poses, {len(calibration.outliers)} set aside",
-        *(f"  {p.name:<10} {value_with_uncertainty(p.value, p.u, p.unit)}" for p in calibration.parameters),
+        *(f"  {p.name:<10} {value_with_uncertainty(p.value, p.u, p.unit)}" for p in shown),
+        *([f"  and {more} of the manipulator's own errors (--json and the report list them)"] if more else []),
     ]
     return summary, lines
 

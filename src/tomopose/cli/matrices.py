@@ -24,6 +24,10 @@ def matrices(
     scanner: Annotated[
         Path | None, typer.Option("--scanner", help="The scan's scanner.json; refused where it is another scanner.")
     ] = None,
+    commands: Annotated[
+        Path | None,
+        typer.Option("--commands", help="Also write what to command so that the real machine reaches the poses."),
+    ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
@@ -35,19 +39,30 @@ def matrices(
     import numpy as np
 
     import tomopose as tp
+    from tomopose.errors import InputError
     from tomopose.files import require_absent
+    from tomopose.manipulator.error_models import correction
     from tomopose.provenance import provenance
 
     say = Say(json=as_json, quiet=quiet)
     require_absent(out, force=force)
-    cal = tp.read_calibration(calibration)
+    cal, scan = tp.read_calibration(calibration), tp.read_poses(poses)
+    if commands is not None:
+        require_absent(commands, force=force)
+        if cal.model == "rigid":
+            raise InputError(f"{calibration} holds no errors of the manipulator; command the poses as they are")
     result = tp.projection_matrices(
-        cal, tp.read_poses(poses), binning=binning, scanner=None if scanner is None else tp.read_scanner(scanner)
+        cal, scan, binning=binning, scanner=None if scanner is None else tp.read_scanner(scanner)
     )
     inputs = [calibration, poses, *([scanner] if scanner else [])]
     tp.write_matrices(
         out, result, provenance=provenance(inputs=inputs, arguments=arguments(binning=binning)), force=force
     )
+    if commands is not None:
+        tp.write_poses(commands, tp.commands_for(cal.manipulator, scan), force=force)
+    if "kind" in cal.manipulator:
+        for note in correction(cal.manipulator, scan).notes:
+            say.note(f"note: {note}")
     sigma = None if result.points_sigma is None else float(np.sqrt(np.mean(result.points_sigma**2)))
     told = "not determinable" if sigma is None else f"{sigma:.2g} px (1 sigma, rms over the field of view)"
     say.result(

@@ -71,8 +71,15 @@ def reconstruct(
     iterations: Annotated[int | None, typer.Option("--iterations", min=1, help="Sweeps over all views.")] = None,
     relaxation: Annotated[float, typer.Option("--relaxation", help="Above 0 and below 2.")] = 0.8,
     order: Annotated[str, typer.Option("--order", help="golden, sequential or random.")] = "golden",
+    subset_size: Annotated[int | None, typer.Option("--subset-size", min=1, help="Views in one update.")] = None,
+    ring_width: Annotated[
+        int | None, typer.Option("--ring-width", min=1, help="Even out pixels that differ from this many neighbours.")
+    ] = None,
     nonnegative: Annotated[bool, typer.Option("--nonnegative", help="Keep attenuation at 0 or above.")] = False,
     memory: Annotated[float | None, typer.Option("--memory-gib", help="Keep within this much memory.")] = None,
+    scratch: Annotated[
+        Path | None, typer.Option("--scratch", help="Folder for the slabs of a volume that does not fit the memory.")
+    ] = None,
     checkpoint: Annotated[
         Path | None, typer.Option("--checkpoint", help="Folder to keep the state in; a second run goes on from there.")
     ] = None,
@@ -94,6 +101,7 @@ def reconstruct(
     from tomopose.cli.job import executor_of, image_source
     from tomopose.files import atomic_file, require_absent
     from tomopose.provenance import provenance
+    from tomopose.reconstruction import PAPER
 
     say = Say(json=as_json, quiet=quiet)
     shape = grid_size(size)
@@ -103,17 +111,21 @@ def reconstruct(
     stack = tp.open_images(image_source(images), dark=dark, flat=flat)
     for warning in stack.warnings:
         say.note(f"note: {warning}")
-    choice: dict[str, Any] = {"algorithm": algorithm, "iterations": iterations, "relaxation": relaxation}
+    choice: dict[str, Any] = {
+        "algorithm": algorithm, "iterations": iterations, "relaxation": relaxation, "order": order,
+        "subset_size": subset_size,
+    }
     if paper:
-        choice = {"algorithm": "sart", "iterations": 1, "relaxation": 0.8}
+        choice = dict(PAPER)
     with say.progress("reconstructing") as progress, executor_of(dask) as client:
         volume = tp.reconstruct(
-            stack, P, tp.VoxelGrid(shape=shape, spacing=voxel), engine=engine, order=order, nonnegative=nonnegative,
-            images_are="transmission" if flat is not None and images_are is None else images_are, white=white,
-            memory_gib=memory, checkpoint=checkpoint, progress=progress, client=client, **choice,
+            stack, P, tp.VoxelGrid(shape=shape, spacing=voxel), engine=engine, nonnegative=nonnegative,
+            ring_width=ring_width, white=white,
+            images_are="transmission" if flat is not None and images_are is None else images_are,
+            memory_gib=memory, scratch=scratch, checkpoint=checkpoint, progress=progress, client=client, **choice,
         )
     made = provenance(
-        inputs=[matrices], arguments=arguments(voxel_mm=voxel, size=size, engine=engine, order=order, **choice)
+        inputs=[matrices], arguments=arguments(voxel_mm=voxel, size=size, engine=engine, **choice)
     )
     volume = replace(volume, provenance=made)
     tp.write_volume(volume, target, force=force)

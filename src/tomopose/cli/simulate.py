@@ -30,7 +30,9 @@ def simulate(
     from tomopose.cli.simulated import write_run
 
     say = Say(json=as_json, quiet=quiet)
-    run = tp.simulate(tp.read_scene(scene))
+    content = tp.read_scene(scene)
+    table = content.poses.file
+    run = tp.simulate(content, poses=tp.read_poses(scene.parent / table) if table else None)
     with say.progress("simulating") as progress:
         write_run(out, run, inputs=[scene], workers=workers, resume=resume, force=force, progress=progress)
     say.result({"out": out.name, "images": len(run)}, [f"{out}: {len(run)} radiographs, tables and truth.json"])
