@@ -34,9 +34,9 @@ TITLE = "Figure 9: source paths"
 QUESTION = "Where does the source stand, seen from the object, and how far is the driven tilt from the one meant?"
 NOTES = (
     "The path is taken from the projection matrices of eq. (5), not drawn from the formula: it passes the whole chain.",
-    "The paper sets the poses with R_HT = R_z(pi), since no calibration was at hand; ours uses the calibrated R_HT. Both "
-    "know the poses that were set, so neither is an error of the reconstruction; the path is just not quite the one "
-    "meant.",
+    "The paper sets the poses with R_HT = R_z(pi), since no calibration was at hand; ours uses the calibrated R_HT. "
+    "Both know the poses that were set, so neither is an error of the reconstruction; the path is just not quite "
+    "the one meant.",
     "The small scale drives fewer views; the path is the same.",
 )
 
@@ -123,12 +123,10 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
         meant = wave(as_meant.alpha)
         off, best = tilt_error(as_set, meant), tilt_error(as_meant, meant)
         both = (as_set, as_meant)
-        for quantity, printed, source, of in (
-            ("largest tilt", high, "sec. 6.1", lambda p: float(np.degrees(p.tilt.max()))),
-            ("smallest tilt", low, "sec. 6.1", lambda p: float(np.degrees(p.tilt.min()))),
-        ):
-            rows.append(StudyRow(group=group, quantity=quantity, unit="deg", source=source, printed=printed,
-                                 paper_method=of(both[0]), best=of(both[1])))
+        for quantity, printed, extreme in (("largest tilt", high, np.max), ("smallest tilt", low, np.min)):
+            found = [float(np.degrees(extreme(p.tilt))) for p in both]
+            rows.append(StudyRow(group=group, quantity=quantity, unit="deg", source="sec. 6.1", printed=printed,
+                                 paper_method=found[0], best=found[1]))
         periods = [crossings(p.tilt) for p in both]
         rows += [
             StudyRow(group=group, quantity="periods", unit="1", source="sec. 6.1", printed=PERIODS,

@@ -14,8 +14,16 @@ from tomopose.provenance import provenance
 from tomopose.studies.result import DEFAULT_SEED, Progress, Scale, StudyResult, require_scale
 from tomopose.studies.steps import Steps
 
-PAPER: Mapping[str, str] = MappingProxyType({"table1": "Table 1", "table2": "Table 2", "figure8": "Fig. 8", "figure9": "Fig. 9",
-                                                "tuy": "Sec. 6.3", "improvements": "Sec. 7"})
+PAPER: Mapping[str, str] = MappingProxyType(
+    {
+        "table1": "Table 1",
+        "table2": "Table 2",
+        "figure8": "Fig. 8",
+        "figure9": "Fig. 9",
+        "tuy": "Sec. 6.3",
+        "improvements": "Sec. 7",
+    }
+)
 """Study -> what of the paper it repeats, in the order in which one reads them; each is a module of this folder."""
 
 

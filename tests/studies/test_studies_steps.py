@@ -1,0 +1,33 @@
+"""Kept steps: an interrupted study goes on with the same numbers, and never with another study's."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tomopose.studies.steps import Steps
+
+
+def test_a_kept_step_is_not_computed_again_and_gives_the_same_numbers(tmp_path):
+    calls = []
+
+    def compute():
+        calls.append(1)
+        return {"x": np.array([0.1, 1 / 3]), "name": "a"}
+
+    steps = Steps(folder=tmp_path, key={"seed": 1})
+    first, second = steps.of("one", compute), steps.of("one", compute)
+    assert len(calls) == 1
+    assert first == second == {"x": [0.1, 1 / 3], "name": "a"} == Steps().of("one", compute)
+
+
+def test_another_key_is_computed_anew(tmp_path):
+    assert Steps(folder=tmp_path, key={"seed": 1}).of("one", lambda: {"x": 1}) == {"x": 1}
+    assert Steps(folder=tmp_path, key={"seed": 2}).of("one", lambda: {"x": 2}) == {"x": 2}
+    assert Steps(folder=tmp_path, key={"seed": 2}).of("one", lambda: {"x": 3}, poses=[1.0]) == {"x": 3}
+
+
+def test_half_a_file_is_computed_anew(tmp_path):
+    steps = Steps(folder=tmp_path)
+    (tmp_path / "one.json").write_text('{"schema": "tomopose/study-step/1", "key":')
+    assert steps.of("one", lambda: {"x": 4}) == {"x": 4}
+    assert Steps(folder=tmp_path).of("one", lambda: {"x": 5}) == {"x": 4}
