@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "measurement"))
-from blurred_shapes import as_volume, balls_on_a_lattice, balls_volume  # noqa: E402
+from blurred_shapes import as_volume, balls_on_a_lattice, balls_volume
 
-from tomopose.measurement.fits import fit_sphere  # noqa: E402
-from tomopose.measurement.histogram import grey_levels  # noqa: E402
-from tomopose.measurement.surface import surface  # noqa: E402
-from tomopose.volume import VoxelGrid  # noqa: E402
+from tomopose.measurement.fits import fit_sphere
+from tomopose.measurement.histogram import grey_levels
+from tomopose.measurement.surface import surface
+from tomopose.volume import VoxelGrid
 
 VOXEL, SIGMA, NOISE = 0.1482, 1.0, 0.05
 

@@ -17,11 +17,11 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "measurement"))
-from blurred_shapes import as_volume, balls_volume  # noqa: E402
+from blurred_shapes import as_volume, balls_volume
 
-from tomopose.measurement.measure import measure  # noqa: E402
-from tomopose.measurement.plan import plan_from  # noqa: E402
-from tomopose.volume import VoxelGrid  # noqa: E402
+from tomopose.measurement.measure import measure
+from tomopose.measurement.plan import plan_from
+from tomopose.volume import VoxelGrid
 
 V = 0.1
 

@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "measurement"))
-from test_measurement_comparison import box  # noqa: E402
+from test_measurement_comparison import box
 
-from tomopose.measurement.meshes import signed_distances  # noqa: E402
+from tomopose.geometry.rotations import exp_rotation
+from tomopose.measurement.meshes import Mesh, signed_distances
 
 
 def main():
@@ -32,8 +33,11 @@ def main():
     x += rng.normal(0, 0.02, args.points)[:, None] * normal[chosen]
     q = np.abs(x) - half
     truth = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
+    # Turned, so that no triangle lies along an axis.
+    turn = exp_rotation(np.array([0.3, -0.5, 0.7]))
+    turned = Mesh(points=mesh.points @ turn.T, faces=mesh.faces)
     wall, cpu = time.perf_counter(), time.process_time()
-    found = signed_distances(x, mesh)
+    found = signed_distances(x @ turn.T, turned)
     print(f"{args.points} points, {len(mesh.faces)} triangles: {time.perf_counter() - wall:.1f} s wall, "
           f"{time.process_time() - cpu:.1f} s CPU, largest error {np.abs(found - truth).max():.1e} mm")
 

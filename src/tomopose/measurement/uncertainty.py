@@ -34,8 +34,8 @@ class Simulated:
 def displaced(P_used: Array, P_true: Array, points: Array) -> Array:
     """Where points (m, 3), mm, are reconstructed, (m, 3): seen by P_true (n, 3, 4), placed by P_used (n, 3, 4).
 
-    Least squares of pixels over all views, all pixels weighing alike.  ShapeError for arrays that do not fit, InputError
-    where the views do not fix a point.
+    Least squares of pixels over all views, all pixels weighing alike.  ShapeError for arrays that do not fit,
+    InputError where the views do not fix a point.
     """
     x = np.asarray(points, dtype=np.float64)
     if x.ndim != 2 or x.shape[1] != 3 or P_used.shape != P_true.shape or P_used.shape[1:] != (3, 4):
@@ -78,7 +78,7 @@ def distance_uncertainty(covariance: Array, points: Array, i: int, j: int) -> fl
     g = np.zeros(3 * len(points))
     g[3 * j: 3 * j + 3] = d / np.linalg.norm(d)
     g[3 * i: 3 * i + 3] = -d / np.linalg.norm(d)
-    return float(np.sqrt(max(g @ covariance @ g, 0.0)))
+    return float(np.sqrt(max(float(g @ covariance @ g), 0.0)))
 
 
 def shortest_interval(values: Array, share: float = 0.95) -> tuple[float, float]:
