@@ -10,6 +10,7 @@ import importlib
 from typing import Any
 
 _HOME = {
+    "BallImage": "tomopose.detection.result",
     "BallObservations": "tomopose.observations",
     "Calibration": "tomopose.calibration.result",
     "Frame": "tomopose.geometry.frames",
@@ -34,6 +35,7 @@ _HOME = {
     "corrected_poses": "tomopose.manipulator.error_models",
     "d_rms_exact": "tomopose.calibration.exact",
     "detect": "tomopose.detection.detect",
+    "detect_image": "tomopose.detection.image",
     "diagnose": "tomopose.calibration.hypotheses",
     "export": "tomopose.exports",
     "inverse_poses": "tomopose.manipulator.inverse",

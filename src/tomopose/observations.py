@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tomopose.errors import InputError, ShapeError
-from tomopose.units import Array, float_array
+from tomopose.units import Array, float_array, rows_at
 
 OPTIONAL_COLUMNS = ("snr", "semi_major", "semi_minor", "angle")
 
@@ -106,8 +106,8 @@ class BallObservations:
         return np.sqrt(np.einsum("nii->ni", self.covariance))
 
     def select(self, index: Any) -> BallObservations:
-        """The rows with those indices (or that mask), in that order."""
-        i = np.arange(len(self))[np.asarray(index)]
+        """The rows with those indices (or that mask or slice), in that order."""
+        i = rows_at(len(self), index)
 
         def of(column: Any) -> Any:
             return None if column is None else column[i]

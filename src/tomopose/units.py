@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -42,8 +41,6 @@ def value_with_uncertainty(value: float, u: float, unit: str = "") -> str:
     return f"{value:.{-last}f}({scaled}){tail}"
 
 
-def column_ranges(values: Iterable[float]) -> tuple[float, float]:
-    """Smallest and largest finite value; (nan, nan) where there is none."""
-    array = np.asarray(list(values), dtype=np.float64)
-    array = array[np.isfinite(array)]
-    return (float(array.min()), float(array.max())) if array.size else (math.nan, math.nan)
+def rows_at(n: int, index: Any) -> np.ndarray:
+    """Row numbers (m,) out of 0 .. n - 1 that a mask, a slice or a list of indices means."""
+    return np.arange(n)[index if isinstance(index, slice) else np.asarray(index)]

@@ -13,7 +13,7 @@ from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import log_rotation, rotation_from_convention
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.units import Array, float_array
+from tomopose.units import Array, float_array, rows_at
 
 PIVOT_TOLERANCE_MM = 1e-6
 
@@ -105,8 +105,8 @@ class PoseSequence:
         return cls(T_MH=T_MH, pose_id=tuple(str(i) for i in ids), convention=convention, **columns)
 
     def select(self, index: Any) -> PoseSequence:
-        """The poses with those indices (or that mask), in that order."""
-        i = np.arange(len(self))[np.asarray(index)]
+        """The poses with those indices (or that mask or slice), in that order."""
+        i = rows_at(len(self), index)
 
         def of(column: tuple[str, ...] | None) -> tuple[str, ...] | None:
             return None if column is None else tuple(column[k] for k in i)
