@@ -71,7 +71,7 @@ def rows(volume, centres, radius):
 
 def time_large(size, seed):
     """Balls of a radius that gives about one million vertices at 512."""
-    grid, _, volumes = scene(size, seed, 0.108 * size, noisy=False)
+    grid, _, volumes = scene(size, seed, 0.085 * size, noisy=False)
     rng = np.random.default_rng(seed)
     values = volumes["clean"].astype(np.float32)
     del volumes

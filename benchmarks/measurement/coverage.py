@@ -36,9 +36,9 @@ def noise_of(rng, shape, sd, correlation):
 
 def one(rng, sd, correlation):
     """(result, truth) of both lengths in a volume with a block beside two balls, at random sub-voxel places."""
-    grid = VoxelGrid(shape=(38, 38, 84), spacing=np.full(3, V))
+    grid = VoxelGrid(shape=(38, 38, 92), spacing=np.full(3, V))
     shift = rng.uniform(-0.05, 0.05, (3, 3))
-    balls = np.array([[-2.3, 0, 0], [2.3, 0, 0]]) + shift[:2]
+    balls = np.array([[-2.7, 0, 0], [2.7, 0, 0]]) + shift[:2]
     values = balls_volume(grid, balls, np.full(2, 0.95), V)
     length = 1.4 + rng.uniform(-0.05, 0.05)
     z, y, x = (grid.origin[2 - a] + V * np.arange(grid.shape[a]) - shift[2, 2 - a] for a in range(3))
