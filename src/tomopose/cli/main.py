@@ -30,9 +30,11 @@ VERBS = (
     "export",
     "import_geometry",
     "reconstruct",
+    "measure",
     "compare",
     "monitor",
     "report",
+    "study",
     "doctor",
 )
 """The modules of this folder that hold a verb each, in the order of --help; each has `register(app)`."""
