@@ -41,14 +41,6 @@ def grid_size(text: str) -> tuple[int, int, int]:
     return z, y, x
 
 
-def pictures(volume: Any) -> dict[str, bytes]:
-    """PNGs of the three middle slices and of the maximum projection, z or y upwards."""
-    from tomopose.report.png import grey_levels, grey_png
-
-    images = (*volume.slices(), volume.maximum_projection())
-    return {name: grey_png(grey_levels(image)[::-1].copy()) for name, image in zip(PICTURES, images, strict=True)}
-
-
 def reconstruct(
     matrices: Annotated[Path, typer.Option("--matrices", help="matrices.npz of the scan.")],
     images: Annotated[str, typer.Option("--images", help="Folder, glob or multi-page file of the scan's images.")],
@@ -102,11 +94,13 @@ def reconstruct(
     from tomopose.files import atomic_file, require_absent
     from tomopose.provenance import provenance
     from tomopose.reconstruction import PAPER
+    from tomopose.report import volume_pictures, volume_report, write_report
 
     say = Say(json=as_json, quiet=quiet)
     shape = grid_size(size)
     target = require_absent(out, force=force)
     shown = {name: require_absent(out.with_name(f"{out.stem}_{name}.png"), force=force) for name in PICTURES}
+    page = require_absent(out.with_name(f"{out.stem}.html"), force=force)
     P = tp.read_matrices(matrices)
     stack = tp.open_images(image_source(images), dark=dark, flat=flat)
     for warning in stack.warnings:
@@ -129,14 +123,15 @@ def reconstruct(
     )
     volume = replace(volume, provenance=made)
     tp.write_volume(volume, target, force=force)
-    for name, png in pictures(volume).items():
+    for name, png in volume_pictures(volume).items():
         with atomic_file(shown[name]) as temporary:
             temporary.write_bytes(png)
+    write_report(page, volume_report(volume))
     residual = None if volume.view_residual is None else float(np.median(volume.view_residual))
     say.result(
         {"out": out.name, "shape_zyx": list(shape), "voxel_mm": voxel, "median_view_residual": residual,
          "notes": list(volume.notes), "settings": dict(volume.settings)},
-        [f"{out}: {shape[2]} x {shape[1]} x {shape[0]} voxels of {voxel:g} mm",
+        [f"{out}: {shape[2]} x {shape[1]} x {shape[0]} voxels of {voxel:g} mm; pictures and {page.name} beside it",
          *([] if residual is None else [f"  residual of a view's reprojection, median: {residual:.3g}"]),
          *(f"  note: {note}" for note in volume.notes)],
     )

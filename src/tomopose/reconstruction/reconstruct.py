@@ -154,6 +154,10 @@ def reconstruct(
     options = dict(engine_options or {})
     stride = sampling_stride(matrices)
     if algorithm == "cgls":
+        unserved = {"checkpoint": checkpoint, "scratch": scratch, "client": client, "slabs": slabs}
+        asked = [option for option, value in unserved.items() if value is not None]
+        if asked:
+            raise InputError(f"cgls works on the whole volume in memory and serves no {asked[0]}; sart and ossart do")
         require_room_for_cgls(matrices, grid, memory_gib=memory_gib)
         values, residual = solve_cgls(name, scan, grid, support, options, int(sweeps), progress)
     else:

@@ -20,6 +20,7 @@ from tomopose.report.page import (
     write_report,
 )
 from tomopose.report.thumbnails import Thumbnail, thumbnail, worst_thumbnails
+from tomopose.report.volume_page import volume_pictures, volume_report
 
 __all__ = [
     "Figure",
@@ -38,6 +39,8 @@ __all__ = [
     "observations_report",
     "render",
     "thumbnail",
+    "volume_pictures",
+    "volume_report",
     "worst_thumbnails",
     "write_report",
 ]

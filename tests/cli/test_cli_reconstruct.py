@@ -1,0 +1,85 @@
+"""From radiographs and matrices to a volume, its pictures and its page."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import tomopose as tp
+from tomopose.cli.main import run
+from tomopose.geometry.projection import eq5_matrices
+
+CENTRE, RADIUS, MU = np.array([3.0, -2.0, 1.5]), 4.0, 0.05
+
+
+@pytest.fixture
+def scan(tmp_path):
+    """A tilted scan of one ball, transmission without noise, 48 views of 61 x 55 pixels."""
+    scanner = tp.Scanner(d_SD=600.0, d_SR=200.0, p_u=1.4, p_v=1.6, u_0=31.2, v_0=26.3, n_u=61, n_v=55)
+    poses = tp.tilted_scan(48, lambda a: np.radians(5.0) * np.sin(3 * a))
+    mount = tp.RigidTransform.from_angles([0, 0, np.pi], [0, 0, 0], source=tp.Frame.H, target=tp.Frame.T)
+    P = eq5_matrices(scanner, T_HT=mount, T_MH=poses.T_MH, alpha=poses.alpha)
+    matrices = tp.ProjectionMatrices(
+        P=P, n_u=scanner.n_u, n_v=scanner.n_v, p_u=scanner.p_u, p_v=scanner.p_v, pose_id=poses.pose_id
+    )
+    tp.write_matrices(tmp_path / "matrices.npz", matrices)
+    g = matrices.decompose()
+    u, v = np.meshgrid(np.arange(61), np.arange(55))
+    for j in range(len(P)):
+        pixel = g.centre[j] + (u - 30.0)[..., None] * g.U[j] + (v - 27.0)[..., None] * g.V[j]
+        ray = pixel - g.source[j]
+        ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+        to_ball = CENTRE - g.source[j]
+        b2 = to_ball @ to_ball - (ray @ to_ball) ** 2
+        chord = 2 * np.sqrt(np.maximum(RADIUS**2 - b2, 0.0))
+        tp.write_tiff(tmp_path / "scan" / f"{j:03d}.tif", np.exp(-MU * chord).astype(np.float32))
+    return tmp_path
+
+
+def words(folder, *more):
+    given = ["reconstruct", "--matrices", folder / "matrices.npz", "--images", folder / "scan", "--voxel-mm", 0.6]
+    return [*map(str, [*given, "--size", 45, "--out", folder / "volume.h5", *more])]
+
+
+def test_the_ball_lies_where_it_was(scan, capsys):
+    assert run(words(scan, "--images-are", "transmission", "--json")) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["shape_zyx"] == [45, 45, 45]
+    volume = tp.read_volume(scan / "volume.h5")
+    inside = volume.values > MU / 2
+    index = np.argwhere(inside).astype(float)
+    assert_allclose(volume.grid.points(index).mean(axis=0), CENTRE, atol=0.1)
+    assert_allclose(volume.values[inside].mean(), MU, rtol=0.1)
+    for name in ("slice_z", "slice_y", "slice_x", "maximum"):
+        assert (scan / f"volume_{name}.png").read_bytes().startswith(b"\x89PNG")
+    page = (scan / "volume.html").read_text(encoding="utf-8")
+    assert "Residual by view" in page
+    assert "Maximum along y" in page
+
+
+def test_what_a_pixel_holds_is_never_guessed(scan, capsys):
+    assert run(words(scan)) == 1
+    assert "transmission" in capsys.readouterr().err
+    assert not (scan / "volume.h5").exists()
+
+
+def test_wrong_number_of_images_is_named(scan, capsys):
+    (scan / "scan" / "047.tif").unlink()
+    assert run(words(scan, "--images-are", "transmission")) == 1
+    assert "47" in capsys.readouterr().err
+    assert not (scan / "volume.h5").exists()
+
+
+@pytest.mark.parametrize("size", ["0", "10,10", "ten"])
+def test_sizes_that_are_none(scan, size, capsys):
+    assert run(words(scan, "--size", size)) == 2
+    assert "--size" in capsys.readouterr().err
+
+
+def test_cgls_refuses_what_it_does_not_serve(scan, capsys):
+    more = ["--images-are", "transmission", "--algorithm", "cgls", "--checkpoint", str(scan / "state")]
+    assert run(words(scan, *more)) == 1
+    assert "checkpoint" in capsys.readouterr().err
