@@ -27,6 +27,7 @@ MAGNIFICATION = 5.3
 TITLE = "Figure 8: reprojection error pose by pose"
 QUESTION = "Which poses carry the residuals of a real calibration, and are they gone once the errors are identified?"
 NOTES = (
+    "The small scale takes 2 x 2 x 2 x 7 poses; the printed numbers are those of 3 x 3 x 3 x 7.",
     "(a) is the run of table 1, (b) run 1 of table 2's virtual hexapod at M 5.3. Its errors are chosen after the "
     "printed numbers (see study table2), so (b) shows that this form of error explains the figure, not that it is "
     "the only one that does.",

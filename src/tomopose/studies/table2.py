@@ -36,6 +36,7 @@ QUESTION = (
     "remains once its errors are identified from the same radiographs?"
 )
 NOTES = (
+    "The small scale takes 2 x 2 x 2 x 7 poses; the printed numbers are those of 3 x 3 x 3 x 7.",
     "The hexapod is virtual: its tilts are made about axes turned by 2.64 mrad about z (and 0.79 mrad about y) against "
     "those of its translations, with its own pivot 150 mm (M 5.3) or 92 mm (M 2.7) below the set one. These numbers "
     "are chosen so that the rigid fit leaves the printed residuals; they are not printed.",
