@@ -196,8 +196,8 @@ def _factor(J: Array, damping: float = 0.0) -> tuple[Array, Array] | None:
     SVD of some hundred equations.
     """
     N = J.T @ J
-    scale = np.sqrt(np.diag(N))
-    scale = np.where(scale > 0, scale, 1.0)
+    lengths = np.sqrt(np.diag(N))
+    scale: Array = np.where(lengths > 0, lengths, 1.0)
     N = N / scale[:, None] / scale
     N[np.diag_indices(len(N))] += damping
     try:
