@@ -120,7 +120,7 @@ def _draw(ax: Any, trace: Mapping[str, Any], k: int, n: int) -> None:
         points = [trace["x"], trace["y"], *([trace["z"]] if kind == "scatter3d" else [])]
         ax.plot(
             *points, linestyle={"dash": "--", "dot": ":"}.get(line.get("dash", ""), "-") if lines else "none",
-            color=(line if lines else marker).get("color"), linewidth=line.get("width", 1.5),
+            color=(line if lines else marker).get("color"), linewidth=min(line.get("width", 1.5), 2.0),
             marker="o" if "markers" in trace.get("mode", "") else "", markersize=0.6 * marker.get("size", 6), **shown,
         )
     elif kind == "bar":
@@ -157,6 +157,7 @@ def figure_png(path: str | Path, figure: Figure) -> None:
                 getattr(ax, f"set_{letter}scale")("log")
         if solid:
             ax.set_aspect("equal")
+            ax.locator_params(axis="z", nbins=3)
         ax.set_title(figure.title)
         if ax.get_legend_handles_labels()[1]:
             ax.legend(fontsize=8)
