@@ -201,7 +201,7 @@ def _factor(J: Array, damping: float = 0.0) -> tuple[Array, Array] | None:
     N = N / scale[:, None] / scale
     N[np.diag_indices(len(N))] += damping
     try:
-        return np.linalg.cholesky(N), scale
+        return np.asarray(np.linalg.cholesky(N), dtype=np.float64), scale
     except np.linalg.LinAlgError:
         return None
 
