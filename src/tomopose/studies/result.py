@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -109,7 +109,3 @@ def check_between(statement: str, value: float, low: float, high: float, unit: s
     """Holds where low <= value <= high."""
     return StudyCheck(statement=statement, found=f"{value:.3g} {unit} (from {low:g} to {high:g})".strip(),
                       holds=bool(low <= value <= high))
-
-
-Rows = list[StudyRow]
-Content = Mapping[str, Any]
