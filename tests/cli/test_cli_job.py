@@ -155,3 +155,23 @@ def test_reports_from_what_a_folder_holds(files, capsys):
     assert run(["report", str(f / "nowhere"), "--out", str(f / "none.html")]) == 1
     assert "holds no calibration.json" in capsys.readouterr().err
     assert not (f / "none.html").exists()
+
+
+def test_plans_are_written_with_their_command_list(files, capsys):
+    f = files.folder
+    words = ["plan", "poses", "--grid", "2", "--table-angles-deg", "0,90", "--commands", "pi-gcs", "--json"]
+    assert run([*words, "--out", str(f / "plan.csv")]) == 0
+    assert json.loads(capsys.readouterr().out)["poses"] == 112
+    assert len(tp.read_poses(f / "plan.csv")) == 112
+    assert (f / "plan.gcs").read_text().count("MOV ") == 112
+    assert run(["plan", "scan", "--shape", "sine", "--views", "21", "--quiet", "--out", str(f / "scan.csv")]) == 0
+    scan = tp.read_poses(f / "scan.csv")
+    assert len(scan) == 21
+    assert np.degrees(rotation_angle_between(np.eye(3), scan.T_MH.R)).max() <= 5.0 + 1e-9
+
+
+def test_a_plan_that_loses_the_ball_is_refused(files, capsys):
+    words = ["plan", "poses", "--scanner", str(files.folder / "scanner.json"), "--half-range-mm", "60"]
+    assert run([*words, "--out", str(files.folder / "far.csv")]) == 1
+    assert "field of view" in capsys.readouterr().err
+    assert not (files.folder / "far.csv").exists()

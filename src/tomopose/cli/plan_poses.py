@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
 EPILOG = "Example: tomopose plan poses --scanner scanner.json --optimal --table-angles-deg 0,90 --out poses.csv"
 
+KINEMATIC_IMAGES = 100
+"""Images of a kinematic plan unless given."""
+
 SUFFIXES = {"pi-gcs": ".gcs", "kuka-krl": ".src", "abb-rapid": ".mod", "ur-script": ".script"}
 
 
@@ -44,20 +47,48 @@ def require_ball_in_view(scanner: Scanner, sequence: PoseSequence, ball_diameter
         )
 
 
+def plan_limits(*, half_range: float, tilt: float, table_angles: tuple[float, ...], ball_diameter: float) -> Any:
+    """Travel (mm, deg), table angles (deg) and ball (mm) as PlanLimits."""
+    from tomopose.planning.limits import PlanLimits
+    from tomopose.trajectory.feasibility import TravelLimits
+
+    angle = math.radians(tilt)
+    travel = TravelLimits.symmetric(x=half_range, y=half_range, z=half_range, rx=angle, ry=angle, rz=angle)
+    return PlanLimits(
+        travel=travel, table_angles=tuple(math.radians(a) for a in table_angles), ball_radius=ball_diameter / 2
+    )
+
+
+def kinematic_poses(
+    scanner: Scanner, machine: Any, *, half_range: float, tilt: float, table_angles: tuple[float, ...],
+    ball_diameter: float, images: int,
+) -> Any:
+    """The plan that determines what a tilted scan needs of the manipulator's own errors."""
+    import numpy as np
+
+    from tomopose.calibration.kinematic_design import plan_kinematic
+    from tomopose.calibration.kinematic_trajectory import object_points
+    from tomopose.planning.design import BALL_MM, nominal_mount
+    from tomopose.planning.limits import candidates
+    from tomopose.planning.target import default_scan
+
+    limits = plan_limits(half_range=half_range, tilt=tilt, table_angles=table_angles, ball_diameter=ball_diameter)
+    mount = nominal_mount()
+    ball = np.array(BALL_MM)
+    return plan_kinematic(
+        scanner, machine, T_HT=mount, balls=ball, candidates=candidates(scanner, T_HT=mount, t=ball, limits=limits),
+        scan=default_scan(mount), points=object_points(), n=images,
+    )
+
+
 def best_poses(
     scanner: Scanner, *, half_range: float, tilt: float, table_angles: tuple[float, ...], ball_diameter: float,
     images: int | None, goal: float | None,
 ) -> Any:
     """The plan that tells a tilted scan's matrices best, within the given travel (mm, deg) and table angles (deg)."""
     from tomopose.planning.design import plan_poses
-    from tomopose.planning.limits import PlanLimits
-    from tomopose.trajectory.feasibility import TravelLimits
 
-    angle = math.radians(tilt)
-    travel = TravelLimits.symmetric(x=half_range, y=half_range, z=half_range, rx=angle, ry=angle, rz=angle)
-    limits = PlanLimits(
-        travel=travel, table_angles=tuple(math.radians(a) for a in table_angles), ball_radius=ball_diameter / 2
-    )
+    limits = plan_limits(half_range=half_range, tilt=tilt, table_angles=table_angles, ball_diameter=ball_diameter)
     return plan_poses(scanner, n=images, goal=goal, limits=limits)
 
 
@@ -67,6 +98,12 @@ def poses(
     optimal: Annotated[
         bool, typer.Option("--optimal", help="Instead of the grid: the poses that serve a tilted scan best.")
     ] = False,
+    purpose: Annotated[
+        str, typer.Option("--for", help="With --optimal: rigid, or kinematic to identify the manipulator's errors.")
+    ] = "rigid",
+    manipulator: Annotated[
+        Path | None, typer.Option("--manipulator", help="hexapod.json or robot.json, for --for kinematic.")
+    ] = None,
     images: Annotated[
         int | None, typer.Option("--images", help="With --optimal: how many; default as few as equal the paper's 189.")
     ] = None,
@@ -110,17 +147,31 @@ def poses(
     if optimal:
         if geometry is None:
             raise typer.BadParameter("an optimal plan needs the scanner", param_hint="--scanner")
-        plan = best_poses(
-            geometry, half_range=half_range, tilt=tilt, table_angles=angles, ball_diameter=ball_diameter,
-            images=images, goal=goal,
-        )
-        sequence = plan.poses
-        summary |= {"predicted_px": plan.predicted, "paper_189_px": plan.reference, "u": dict(plan.u),
-                    "duration_s": plan.duration}
-        lines.append(
-            f"  predicted scan reprojection error {plan.predicted:.4f} px (the paper's 189 poses: "
-            f"{plan.reference:.4f} px), about {plan.duration / 60:.0f} minutes"
-        )
+        given: dict[str, Any] = {
+            "half_range": half_range, "tilt": tilt, "table_angles": angles, "ball_diameter": ball_diameter
+        }
+        if purpose == "kinematic":
+            if manipulator is None:
+                raise typer.BadParameter("its nominal geometry is needed", param_hint="--manipulator")
+            machine = tp.read_manipulator(manipulator)
+            found = kinematic_poses(geometry, machine, images=images or KINEMATIC_IMAGES, **given)
+            sequence = found.poses
+            summary |= {"trusted_px": found.trusted, "identified_px": found.identified}
+            lines.append(
+                f"  predicted scan error: {found.trusted:.3g} px if the poses are trusted, {found.identified:.3g} px "
+                "with the manipulator's errors identified from these images"
+            )
+        elif purpose == "rigid":
+            plan = best_poses(geometry, images=images, goal=goal, **given)
+            sequence = plan.poses
+            summary |= {"predicted_px": plan.predicted, "paper_189_px": plan.reference, "u": dict(plan.u),
+                        "duration_s": plan.duration}
+            lines.append(
+                f"  predicted scan reprojection error {plan.predicted:.4f} px (the paper's 189 poses: "
+                f"{plan.reference:.4f} px), about {plan.duration / 60:.0f} minutes"
+            )
+        else:
+            raise typer.BadParameter(f"{purpose!r} is neither rigid nor kinematic", param_hint="--for")
     else:
         sequence = tp.pose_grid(
             grid, half_range=half_range, tilt=math.radians(tilt), table_angles=[math.radians(a) for a in angles]
