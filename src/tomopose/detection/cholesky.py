@@ -22,19 +22,27 @@ def solve(N: Array, B: Array) -> Array:
     return np.asarray(X)
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath={"reassoc", "contract"})
 def _solve(N, B):  # type: ignore[no-untyped-def]
     n, m = B.shape
     scale = np.empty(n)
     for i in range(n):
-        scale[i] = 1.0 / math.sqrt(N[i, i]) if N[i, i] > 0.0 else 0.0
+        scale[i] = 1.0 / math.sqrt(N[n - 1 - i, n - 1 - i]) if N[n - 1 - i, n - 1 - i] > 0.0 else 0.0
+    # The last unknown is eliminated first: angular nodes that know only their neighbours come before the shape that
+    # all know, and a row of the factor is empty before the first entry of its row of N.
     L = np.zeros((n, n))
+    first = np.empty(n, np.int64)
     for i in range(n):
-        for j in range(i + 1):
-            total = N[i, j] * scale[i] * scale[j]
+        first[i] = i
+        for j in range(i):
+            if N[n - 1 - i, n - 1 - j] != 0.0:
+                first[i] = j
+                break
+        for j in range(first[i], i + 1):
+            total = N[n - 1 - i, n - 1 - j] * scale[i] * scale[j]
             if i == j:
                 total = 1.0 + RIDGE if scale[i] > 0.0 else 1.0
-            for k in range(j):
+            for k in range(max(first[i], first[j]), j):
                 total -= L[i, k] * L[j, k]
             if i == j:
                 if not total > 0.0:
@@ -45,8 +53,8 @@ def _solve(N, B):  # type: ignore[no-untyped-def]
     X = np.empty((n, m))
     for i in range(n):
         for c in range(m):
-            X[i, c] = B[i, c] * scale[i]
-        for k in range(i):
+            X[i, c] = B[n - 1 - i, c] * scale[i]
+        for k in range(first[i], i):
             f = L[i, k]
             if f != 0.0:
                 for c in range(m):
@@ -56,7 +64,7 @@ def _solve(N, B):  # type: ignore[no-untyped-def]
     for i in range(n - 1, -1, -1):
         for c in range(m):
             X[i, c] /= L[i, i]
-        for k in range(i):
+        for k in range(first[i], i):
             f = L[i, k]
             if f != 0.0:
                 for c in range(m):
@@ -64,4 +72,4 @@ def _solve(N, B):  # type: ignore[no-untyped-def]
     for i in range(n):
         for c in range(m):
             X[i, c] *= scale[i]
-    return True, X
+    return True, X[::-1].copy()

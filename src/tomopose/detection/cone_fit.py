@@ -17,8 +17,8 @@ import numpy.typing as npt
 from tomopose.detection.cholesky import solve
 from tomopose.detection.cone import ring_pixels
 from tomopose.detection.edges import FIRST_NODE, N_SHAPE, SHAPE, influence
-from tomopose.detection.noise import correlation, sandwich, sector_median
-from tomopose.detection.rim import Rim
+from tomopose.detection.noise import correlation, sandwich, weights
+from tomopose.detection.rim import STAY, Rim
 from tomopose.errors import BallNotFoundError
 from tomopose.geometry.scanner import Scanner
 from tomopose.units import Array
@@ -106,7 +106,7 @@ def fit_cone(
     if kappa_free:
         _choose_kappa(rim, spread, start)
         shape = (*shape, "kappa")
-    rim.outside = rim.reach
+    rim.outside, rim.every = rim.reach, 1
     rim.gather()
     _robust_background(rim, spread)
     if kappa_free:
@@ -142,7 +142,7 @@ def _approach(rim: Rim, spread: float) -> None:
     prior[:, 0], prior[:, 1] = 1 / (STEEPEST * spread) ** 2, (rim.reach / (STEEPEST * spread)) ** 2
     rim.precision = prior.ravel()
     rim.white_prior = (float(np.mean(rim.value)), 1 / (STEEPEST * spread) ** 2)
-    rim.evaluate()
+    rim.evaluate(STAY)
     rim.step(rim.active(curvature=False))
     for turn in range(14):
         moved = rim.step(rim.active("u", "v", "radius", *(("sigma",) if turn else ()), curvature=False))
@@ -150,8 +150,8 @@ def _approach(rim: Rim, spread: float) -> None:
             break
         if turn in (1, 3, 6, 9) and moved > 0.02:
             rim.gather()
-            rim.evaluate()
-        away = np.abs(rim.rim[:, 0]) > 3.0 + 2 * moved
+            rim.evaluate(STAY)
+        away = np.abs(rim.rim[0]) > 3.0 + 2 * moved
         scale = 1.4826 * float(np.median(np.abs(rim.residual[away]))) if away.any() else 0.0
         out = away & (np.abs(rim.residual) > max(8 * scale, 0.1 * spread))
         rim.weight = np.where(out, 0.0, 1.0 / (0.03 * spread) ** 2)
@@ -161,15 +161,18 @@ def _robust_background(rim: Rim, spread: float) -> None:
     """The background over the whole ring; dead lines and hot pixels, if there are any, get little weight (Cauchy)."""
     equal = np.full(rim.u.size, 1.0 / (0.03 * spread) ** 2)
     rim.weight = equal
-    rim.evaluate()
+    rim.evaluate(STAY)
     active = rim.active(curvature=False)
     rim.step(active)
-    away = np.abs(rim.rim[:, 0]) > 3.0
+    away = np.abs(rim.rim[0]) > 3.0
     for _ in range(6):
-        scale = 1.4826 * float(np.median(np.abs(rim.residual[away]))) + 1e-9 * spread
-        x = np.where(away, rim.residual / (3.0 * scale), 0.0)
-        if np.abs(x).max() < 3.0 or np.abs(rim.residual[away]).max() < GROSS * abs(rim.level - rim.white):
+        size = np.abs(rim.residual[away])
+        if size.size == 0 or size.max() < GROSS * abs(rim.level - rim.white):
             break
+        scale = 1.4826 * float(np.median(size)) + 1e-9 * spread
+        if size.max() < 9.0 * scale:
+            break
+        x = np.where(away, rim.residual / (3.0 * scale), 0.0)
         rim.weight = equal / (1.0 + x**2) ** 2
         rim.step(active)
 
@@ -185,7 +188,7 @@ def _is_transparent(rim: Rim) -> bool:
     for low, high in rings:
         *_, value = ring_pixels(
             rim.window, rim.good, rim.origin[0], rim.origin[1], rim.shape[0], rim.shape[1], low, high,
-            rim.scanner.p_u / rim.p, rim.scanner.p_v / rim.p,
+            rim.scanner.p_u / rim.p, rim.scanner.p_v / rim.p, 1,
         )  # fmt: skip
         if value.size < 5:
             return False
@@ -224,27 +227,12 @@ def _weigh(rim: Rim, floor: float, parameters: float) -> tuple[float, float, Arr
     does not count as noise; parameters: linear parameters that a sector's pixels determine.  The last result
     is each sector's chi-square less 1, in standard deviations.
     """
-    s, sigma, k = rim.rim[:, 0], rim.shape[3], rim.n_nodes
-    square = rim.residual**2
-    outside, inside = s > 3 * sigma, s < -3 * sigma
-    limit = OUTLIER**2 * (sector_median(square[outside], rim.left[outside], k)[rim.left] / 0.455 + floor)
-    rim_zone = ~(outside | inside)
-    if rim_zone.any():
-        limit[rim_zone] = np.maximum(limit[rim_zone], OUTLIER**2 * np.median(square[rim_zone]) / 0.455)
-    used = square < np.where(s > -3 * sigma, limit, np.maximum(limit, OUTLIER**2 * floor))
-    n_k = np.bincount(rim.left, weights=used & outside, minlength=k)
-    enough = n_k > 2 * parameters + 2
-    if not enough.any():
+    weight, v_in, v_out, chi2, n_k = weights(
+        rim.rim[0], rim.residual, rim.model, rim.first, rim.shape[3], rim.level, rim.white, floor, parameters, OUTLIER
+    )
+    if not math.isfinite(v_out):
         raise BallNotFoundError("too few usable pixels outside the rim to measure the noise")
-    mean = np.bincount(rim.left, weights=square * (used & outside), minlength=k) / np.maximum(n_k - parameters, 1)
-    v_out = max(float(np.median(mean[enough])), floor)
-    core = inside & used if (inside & used).sum() > 20 else used & (s < 0)
-    v_in, level_in = (float(square[core].mean()), float(rim.model[core].mean())) if core.any() else (v_out, rim.white)
-    v_in = max(v_in, floor)
-    x = np.clip((rim.model - level_in) / (rim.level - level_in), 0.0, 1.3)
-    expected = np.maximum(v_in + (v_out - v_in) * x, min(v_in, v_out))
-    chi2 = np.bincount(rim.left, weights=square * (used & outside) / expected, minlength=k) / np.maximum(n_k, 1)
-    rim.weight = np.where(used, 1.0 / expected, 0.0)
+    rim.weight = weight
     return v_in, v_out, (chi2 - 1.0) / np.sqrt(2.0 / np.maximum(n_k, 1))
 
 
@@ -289,7 +277,7 @@ def _result(
     rows = solve(N, np.eye(active.size, m)).T
     at = [SHAPE.index(name) for name in shape]
     block = (rows[:, :m] + rows[:, :m].T) / 2
-    s, sigma = rim.rim[:, 0], rim.shape[3]
+    s, sigma = rim.rim[0], rim.shape[3]
     clean = (rim.weight > 0) & (excess < MISFIT)[rim.left]
     outside = (s > 3 * sigma) & (rim.weight > 0) & (excess <= np.median(excess))[rim.left]
     normalised = rim.residual * np.sqrt(rim.weight)
@@ -339,14 +327,10 @@ def _scattered(rim: Rim, active: npt.NDArray[np.intp], rows: Array) -> Array:
 def _rim_shares(rim: Rim) -> tuple[float, float]:
     """Share of the rim's directions with a pixel in the image, and share of the rim's pixels that were left out."""
     radius, half = rim.shape[2], max(1.5, 2 * rim.shape[3])
-    u, v, _ = ring_pixels(
-        rim.window, np.ones_like(rim.good), rim.origin[0], rim.origin[1], rim.shape[0], rim.shape[1], radius - half - 1,
-        radius * 1.1 + half + 1, rim.scanner.p_u / rim.p, rim.scanner.p_v / rim.p,
-    )  # fmt: skip
-    every = rim.coordinates(u, v)
-    every = every[np.abs(every[:, 0]) < half]
+    *_, every = rim.ring(np.ones_like(rim.good), -half, half, 1)
+    every = every[:, np.abs(every[0]) < half]
     bins = int(np.clip(2 * radius, 16, 180))
-    angle = np.arctan2(every[:, 5], every[:, 4])
+    angle = np.arctan2(every[5], every[4])
     seen = np.unique(np.floor((angle / (2 * math.pi) + 0.5) * bins * (1 - 1e-12)))
-    kept = (np.abs(rim.rim[:, 0]) < half) & (rim.weight > 0)
-    return seen.size / bins, max(0.0, 1.0 - float(kept.sum()) / max(len(every), 1))
+    kept = (np.abs(rim.rim[0]) < half) & (rim.weight > 0)
+    return seen.size / bins, max(0.0, 1.0 - float(kept.sum()) / max(every.shape[1], 1))

@@ -25,19 +25,19 @@ FIRST_NODE = N_SHAPE + 1
 
 @njit(cache=True, fastmath=True)
 def model_rows(  # type: ignore[no-untyped-def]
-    rim, nodes, white, table, first, step, sigma, gamma_px, box_u, box_v, q_cos, q_sin, value, jacobian, left, share
+    rim, left, share, nodes, white, table, first, step, sigma, gamma_px, box_u, box_v, q_cos, q_sin, value, jacobian
 ):  # fmt: skip
-    """Fills value (n,), jacobian (n, 14), left (n,) and share (n,): the model and its derivatives at each pixel.
+    """Fills value (n,) and jacobian (14, n): the model and its derivatives at each pixel.
 
-    rim: (n, 6) of cone_coordinates.  nodes: (k, 3).  jacobian columns: shape (7), w, then a, b, c of the node on the
-    left and of that on the right.  gamma_px: rad per px of radius.  box_u, box_v: variance of a pixel's box across a
-    rim normal to u or v, less their mean.
+    rim: (6, n) of cone_coordinates; left, share: (n,) of by_sector.  nodes: (k, 3).  jacobian rows: shape (7), w, then
+    a, b, c of the node on the left and of that on the right.  gamma_px: rad per px of radius.  box_u, box_v: variance
+    of a pixel's box across a rim normal to u or v, less their mean.
     """
-    n, k = rim.shape[0], nodes.shape[0]
-    turn = k / (2.0 * math.pi)
+    n, k = rim.shape[1], nodes.shape[0]
     last = table.shape[0] - 2
+    per_step = 1.0 / step
     for i in range(n):
-        x = (rim[i, 0] - first) / step
+        x = (rim[0, i] - first) * per_step
         j = min(max(int(x), 0), last)
         f = min(max(x - j, 0.0), 1.0)
         O = table[j, 0] + f * (table[j + 1, 0] - table[j, 0])
@@ -50,83 +50,84 @@ def model_rows(  # type: ignore[no-untyped-def]
         Rk = table[j, 7] + f * (table[j + 1, 7] - table[j, 7])
         Q = table[j, 8] + f * (table[j + 1, 8] - table[j, 8])
         Q1 = table[j, 9] + f * (table[j + 1, 9] - table[j, 9])
-        c, s = rim[i, 4], rim[i, 5]
+        c, s = rim[4, i], rim[5, i]
         c2, s2 = c * c - s * s, 2.0 * c * s
         extra = 0.5 * (box_u * c * c + box_v * s * s + q_cos * c2 + q_sin * s2)
+        Q += extra * O
         O += extra * O2
         R += extra * R2
-        Q += extra * O
-        angle = math.atan2(s, c) * turn
-        if angle < 0.0:
-            angle += k
-        node = int(angle)
-        w = angle - node
-        if node >= k:
-            node, w = 0, 0.0
+        node, w = left[i], share[i]
         right = node + 1 if node + 1 < k else 0
         a = (1.0 - w) * nodes[node, 0] + w * nodes[right, 0]
         b = (1.0 - w) * nodes[node, 1] + w * nodes[right, 1]
         e = (1.0 - w) * nodes[node, 2] + w * nodes[right, 2]
-        left[i], share[i] = node, w
         value[i] = a * O + b * R + e * Q + white * (1.0 - O)
         across = (a - white) * O1 + b * R1 + e * Q1
         bend = (a - white) * O2 + b * R2 + e * O
-        jacobian[i, 0] = across * rim[i, 1]
-        jacobian[i, 1] = across * rim[i, 2]
-        jacobian[i, 2] = across * rim[i, 3] * gamma_px
-        jacobian[i, 3] = sigma * bend
-        jacobian[i, 4] = (a - white) * Ok + b * Rk
-        jacobian[i, 5] = 0.5 * bend * c2
-        jacobian[i, 6] = 0.5 * bend * s2
-        jacobian[i, 7] = 1.0 - O
-        jacobian[i, 8] = (1.0 - w) * O
-        jacobian[i, 9] = (1.0 - w) * R
-        jacobian[i, 10] = (1.0 - w) * Q
-        jacobian[i, 11] = w * O
-        jacobian[i, 12] = w * R
-        jacobian[i, 13] = w * Q
+        jacobian[0, i] = across * rim[1, i]
+        jacobian[1, i] = across * rim[2, i]
+        jacobian[2, i] = across * rim[3, i] * gamma_px
+        jacobian[3, i] = sigma * bend
+        jacobian[4, i] = (a - white) * Ok + b * Rk
+        jacobian[5, i] = 0.5 * bend * c2
+        jacobian[6, i] = 0.5 * bend * s2
+        jacobian[7, i] = 1.0 - O
+        jacobian[8, i] = (1.0 - w) * O
+        jacobian[9, i] = (1.0 - w) * R
+        jacobian[10, i] = (1.0 - w) * Q
+        jacobian[11, i] = w * O
+        jacobian[12, i] = w * R
+        jacobian[13, i] = w * Q
 
 
 @njit(cache=True, fastmath=True)
-def normal_equations(image, value, jacobian, left, weight, k):  # type: ignore[no-untyped-def]
-    """(N, g): weighted normal matrix (8 + 3k, 8 + 3k) and right side J' W (image - value)."""
+def normal_equations(image, value, jacobian, first, weight):  # type: ignore[no-untyped-def]
+    """(N, g): weighted normal matrix (8 + 3k, 8 + 3k) and right side J' W (image - value).
+
+    first: (k + 1,) of by_sector.  Within a sector every entry is one sum along the pixels, which runs in registers.
+    """
+    k = first.shape[0] - 1
     size = 8 + 3 * k
     N = np.zeros((size, size))
     g = np.zeros(size)
     column = np.empty(14, np.int64)
-    block = np.zeros((k, 14, 14))
-    right_side = np.zeros((k, 14))
-    for i in range(image.shape[0]):
-        w = weight[i]
-        if w == 0.0:
-            continue
-        r = image[i] - value[i]
-        node = left[i]
-        for p in range(14):
-            jw = jacobian[i, p] * w
-            right_side[node, p] += jw * r
-            for q in range(14):
-                block[node, p, q] += jw * jacobian[i, q]
+    longest = 0
     for node in range(k):
+        longest = max(longest, first[node + 1] - first[node])
+    row = np.empty(longest)
+    for node in range(k):
+        low, n = first[node], first[node + 1] - first[node]
+        if n == 0:
+            continue
         right = node + 1 if node + 1 < k else 0
         for p in range(8):
             column[p] = p
         for p in range(3):
             column[8 + p] = 8 + 3 * node + p
             column[11 + p] = 8 + 3 * right + p
+        w, y, y_model = weight[low : low + n], image[low : low + n], value[low : low + n]
         for p in range(14):
-            g[column[p]] += right_side[node, p]
+            a = jacobian[p, low : low + n]
+            total = 0.0
+            for i in range(n):
+                row[i] = a[i] * w[i]
+                total += row[i] * (y[i] - y_model[i])
+            g[column[p]] += total
             for q in range(p + 1):
-                N[column[p], column[q]] += block[node, p, q]
+                b = jacobian[q, low : low + n]
+                total = 0.0
+                for i in range(n):
+                    total += row[i] * b[i]
+                N[column[p], column[q]] += total
                 if p != q:
-                    N[column[q], column[p]] += block[node, p, q]
+                    N[column[q], column[p]] += total
     return N, g
 
 
 @njit(cache=True)
 def influence(jacobian, left, weight, rows, k):  # type: ignore[no-untyped-def]
     """(n, m): change of m parameters per standard deviation of each pixel's noise; rows (m, 8 + 3k) of the inverse."""
-    n, m = jacobian.shape[0], rows.shape[0]
+    n, m = jacobian.shape[1], rows.shape[0]
     out = np.zeros((n, m))
     for i in range(n):
         node = left[i]
@@ -135,9 +136,9 @@ def influence(jacobian, left, weight, rows, k):  # type: ignore[no-untyped-def]
         for q in range(m):
             total = 0.0
             for p in range(8):
-                total += rows[q, p] * jacobian[i, p]
+                total += rows[q, p] * jacobian[p, i]
             for p in range(3):
-                total += rows[q, 8 + 3 * node + p] * jacobian[i, 8 + p]
-                total += rows[q, 8 + 3 * right + p] * jacobian[i, 11 + p]
+                total += rows[q, 8 + 3 * node + p] * jacobian[8 + p, i]
+                total += rows[q, 8 + 3 * right + p] * jacobian[11 + p, i]
             out[i, q] = total * root
     return out

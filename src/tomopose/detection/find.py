@@ -72,9 +72,10 @@ def find_ball(
     levels = _levels(image.shape, smallest)
     first = [f for f in levels if SMALLEST * f < 1.6 * expected_radius and LARGEST * f > expected_radius / 1.6]
     candidates: list[Candidate] = []
+    means: dict[int, Array] = {}
     for group in (first, [f for f in levels if f not in first]):
         for factor in group:
-            candidates += _on_level(image, factor, aspect)
+            candidates += _on_level(_level(image, factor, means), factor, aspect)
         candidates = _distinct(candidates, expected_radius)
         if candidates and candidates[0].merit > 0.6:
             break
@@ -143,8 +144,14 @@ def _levels(shape: tuple[int, ...], smallest: float) -> list[int]:
     return out or [1]
 
 
-def _on_level(image: Array, factor: int, aspect: float) -> list[Candidate]:
-    level = block_mean(image, factor)
+def _level(image: Array, factor: int, means: dict[int, Array]) -> Array:
+    """The image's mean over blocks, from a finer level where there is one: `means`, to which it is added."""
+    finer = max((f for f in means if f <= factor), default=0)
+    means[factor] = block_mean(means[finer], factor // finer) if finer else block_mean(image, factor)
+    return means[factor]
+
+
+def _on_level(level: Array, factor: int, aspect: float) -> list[Candidate]:
     found = []
     noise, centres = circle_centres(level)
     for u, v, low, high, polarity in centres:
@@ -231,29 +238,35 @@ def check_circle(image, u, v, low, high, sign, aspect, noise, tightness):  # typ
 def _robust_circle(x, y, good, start):  # type: ignore[no-untyped-def]
     """(u, v, radius) through most of the points: least squares, points that disagree given less weight (Cauchy)."""
     cx, cy, radius = 0.0, 0.0, start
-    deviation = np.zeros(x.shape[0])
+    deviation, weight = np.zeros(x.shape[0]), np.zeros(x.shape[0])
     for turn in range(8):
         for k in range(x.shape[0]):
             deviation[k] = math.hypot(x[k] - cx, y[k] - cy) - radius
         scale = 2.0 * max(np.median(np.abs(deviation[good])), 0.05)
-        N, g = np.zeros((3, 3)), np.zeros(3)
+        total, mx, my, ms = 0.0, 0.0, 0.0, 0.0
         for k in range(x.shape[0]):
-            if not good[k]:
-                continue
-            w = 1.0 / (1.0 + (deviation[k] / scale) ** 2)
-            if turn > 0:
-                w *= w
-            row = np.array([2 * x[k], 2 * y[k], 1.0])
-            square = x[k] ** 2 + y[k] ** 2
-            for p in range(3):
-                g[p] += w * row[p] * square
-                for q in range(3):
-                    N[p, q] += w * row[p] * row[q]
-        if abs(np.linalg.det(N)) < 1e-12:
+            weight[k] = 0.0
+            if good[k]:
+                w = 1.0 / (1.0 + (deviation[k] / scale) ** 2)
+                weight[k] = w if turn == 0 else w * w
+                total += weight[k]
+                mx += weight[k] * x[k]
+                my += weight[k] * y[k]
+                ms += weight[k] * (x[k] ** 2 + y[k] ** 2)
+        mx, my, ms = mx / total, my / total, ms / total
+        xx, xy, yy, xs, ys = 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(x.shape[0]):
+            dx, dy, ds = x[k] - mx, y[k] - my, x[k] ** 2 + y[k] ** 2 - ms
+            xx += weight[k] * dx * dx
+            xy += weight[k] * dx * dy
+            yy += weight[k] * dy * dy
+            xs += weight[k] * dx * ds
+            ys += weight[k] * dy * ds
+        determinant = xx * yy - xy * xy
+        if not determinant > 1e-12 * total * total:
             return 0.0, 0.0, -1.0
-        solution = np.linalg.solve(N, g)
-        cx, cy = solution[0], solution[1]
-        radius = math.sqrt(max(solution[2] + cx * cx + cy * cy, 0.0))
+        cx, cy = 0.5 * (yy * xs - xy * ys) / determinant, 0.5 * (xx * ys - xy * xs) / determinant
+        radius = math.sqrt(max(ms - 2 * (cx * mx + cy * my) + cx * cx + cy * cy, 0.0))
     return cx, cy, radius
 
 

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from tomopose.detection.cone import ring_pixels
 from tomopose.detection.cone_fit import ConeFit
 from tomopose.errors import DetectionError
 from tomopose.geometry.scanner import Scanner
@@ -41,9 +42,10 @@ def saturated_share(window: Array, ceiling: float, fit: ConeFit, origin: tuple[i
     Counts clip at a power of two less 1; of other values that many alike are clipped too,
     unless the image is a simulated one without noise.
     """
-    v, u = np.mgrid[: window.shape[0], : window.shape[1]]
-    distance = np.hypot(u + origin[0] - fit.shape[0], v + origin[1] - fit.shape[1]) - fit.shape[2]
-    ring = window[(distance > 2.5 * fit.shape[3]) & (distance < 12.0)]
+    u, v, radius, sigma = (float(x) for x in fit.shape[:4])
+    every_one = np.ones(window.shape, dtype=bool)
+    low, high = radius + 2.5 * sigma, radius + 12.0
+    *_, ring = ring_pixels(window, every_one, origin[0], origin[1], u, v, low, high, 1.0, 1.0, 1)
     if ring.size == 0 or not math.isfinite(ceiling):
         return 0.0
     share = float((ring >= ceiling).mean())

@@ -15,24 +15,77 @@ SMALLEST = 0.06
 """Correlation of neighbours below which noise counts as white: a holder leaves some in the residuals too."""
 
 
+NORMAL_MEDIAN = 0.455
+"""Median of the square of a standard normal variable."""
+
+
 @njit(cache=True)
-def sector_median(values, sector, k):  # type: ignore[no-untyped-def]
-    """Median of the values in each of k sectors; the largest of these where a sector has no value."""
-    count = np.zeros(k + 1, np.int64)
-    for i in range(sector.shape[0]):
-        count[sector[i] + 1] += 1
-    first = np.cumsum(count)
-    place = first.copy()
-    ordered = np.empty(values.shape[0])
-    for i in range(sector.shape[0]):
-        ordered[place[sector[i]]] = values[i]
-        place[sector[i]] += 1
-    out = np.full(k, np.nan)
-    for n in range(k):
-        if first[n + 1] > first[n]:
-            out[n] = np.median(ordered[first[n] : first[n + 1]])
-    largest = np.nanmax(out) if np.any(~np.isnan(out)) else 0.0
-    return np.where(np.isnan(out), largest, out)
+def weights(s, residual, model, first, sigma, level, white, floor, parameters, outlier):  # type: ignore[no-untyped-def]
+    """(weight (n,), variance inside, outside, chi-square (k,) and number (k,) of each sector's pixels outside).
+
+    s: signed distance; first: (k + 1,) of by_sector; floor: least variance; parameters: linear parameters that a
+    sector's pixels determine.  Pixels more than `outlier` standard deviations off get no weight.  The variance
+    outside is the median over the sectors, NaN where none has enough pixels.
+    """
+    n, k = s.shape[0], first.shape[0] - 1
+    square = residual * residual
+    limit, part = np.zeros(k), np.empty(n)
+    largest, n_rim = 0.0, 0
+    for j in range(k):
+        m = 0
+        for i in range(first[j], first[j + 1]):
+            if s[i] > 3 * sigma:
+                part[m] = square[i]
+                m += 1
+        limit[j] = np.median(part[:m]) if m > 0 else -1.0
+        largest = max(largest, limit[j])
+    for j in range(k):
+        limit[j] = outlier**2 * ((limit[j] if limit[j] >= 0.0 else largest) / NORMAL_MEDIAN + floor)
+    for i in range(n):
+        if abs(s[i]) <= 3 * sigma:
+            part[n_rim] = square[i]
+            n_rim += 1
+    rim_limit = outlier**2 * np.median(part[:n_rim]) / NORMAL_MEDIAN if n_rim > 0 else 0.0
+    used = np.zeros(n, np.bool_)
+    mean, count = np.zeros(k), np.zeros(k)
+    n_core, n_inner, core, inner, core_level, inner_level = 0, 0, 0.0, 0.0, 0.0, 0.0
+    for j in range(k):
+        for i in range(first[j], first[j + 1]):
+            most = max(limit[j], rim_limit) if abs(s[i]) <= 3 * sigma else limit[j]
+            if s[i] <= -3 * sigma:
+                most = max(most, outlier**2 * floor)
+            if not square[i] < most:
+                continue
+            used[i] = True
+            if s[i] > 3 * sigma:
+                mean[j] += square[i]
+                count[j] += 1.0
+            elif s[i] < 0.0:
+                n_inner += 1
+                inner += square[i]
+                inner_level += model[i]
+                if s[i] < -3 * sigma:
+                    n_core += 1
+                    core += square[i]
+                    core_level += model[i]
+    enough = count > 2 * parameters + 2
+    if not np.any(enough):
+        return np.zeros(n), np.nan, np.nan, mean, count
+    v_out = max(np.median((mean / np.maximum(count - parameters, 1.0))[enough]), floor)
+    if n_core <= 20:
+        n_core, core, core_level = n_inner, inner, inner_level
+    v_in, level_in = (core / n_core, core_level / n_core) if n_core > 0 else (v_out, white)
+    v_in = max(v_in, floor)
+    weight, chi2 = np.zeros(n), np.zeros(k)
+    for j in range(k):
+        for i in range(first[j], first[j + 1]):
+            if used[i]:
+                x = min(max((model[i] - level_in) / (level - level_in), 0.0), 1.3)
+                weight[i] = 1.0 / max(v_in + (v_out - v_in) * x, min(v_in, v_out))
+                if s[i] > 3 * sigma:
+                    chi2[j] += square[i] * weight[i]
+        chi2[j] /= max(count[j], 1.0)
+    return weight, v_in, v_out, chi2, count
 
 
 def correlation(u: Array, v: Array, normalised: Array, per_parameter: float) -> Array:

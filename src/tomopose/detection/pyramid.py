@@ -22,18 +22,18 @@ def block_mean(image, factor):  # type: ignore[no-untyped-def]
     rows, columns = image.shape[0] // factor, image.shape[1] // factor
     out = np.empty((rows, columns), np.float32)
     scale = np.float32(1.0 / (factor * factor))
-    line = np.empty(columns, np.float32)
+    line = np.empty(columns * factor, np.float32)
     for j in range(rows):
         line[:] = 0.0
         for y in range(factor):
             row = image[j * factor + y]
-            for i in range(columns):
-                total = np.float32(0.0)
-                for x in range(factor):
-                    total += np.float32(row[i * factor + x])
-                line[i] += total
+            for x in range(columns * factor):
+                line[x] += np.float32(row[x])
         for i in range(columns):
-            out[j, i] = line[i] * scale
+            total = np.float32(0.0)
+            for x in range(factor):
+                total += line[i * factor + x]
+            out[j, i] = total * scale
     return out
 
 

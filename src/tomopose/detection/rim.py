@@ -8,17 +8,20 @@ import numpy as np
 import numpy.typing as npt
 
 from tomopose.detection.cholesky import solve
-from tomopose.detection.cone import cone_angle, cone_coordinates, ring_pixels
+from tomopose.detection.cone import by_sector, cone_angle, cone_coordinates, cone_eccentricity, ring_pixels
 from tomopose.detection.edges import FIRST_NODE, N_SHAPE, SHAPE, WHITE, model_rows, normal_equations
 from tomopose.detection.profile import edge_profile
 from tomopose.errors import BallNotFoundError
 from tomopose.geometry.scanner import Scanner
 from tomopose.units import Array
 
+ENOUGH = 1500
+"""Pixels that the way from the finder's circle to the fit's neighbourhood is gone with."""
 MANY, NEAR = 8000, 8.0
 """Of more pixels than this, every second one is left out that lies farther than NEAR px outside the rim."""
 LINEAR = 0.02
 """Largest move, px, after which distances are updated to first order: what is left out is LINEAR^2 / 2 radius."""
+STAY = np.zeros(3)
 SMALLEST_BLUR, LARGEST_STEP = 0.25, 2.0
 
 
@@ -42,31 +45,34 @@ class Rim:
         self.box_u, self.box_v = box - box.mean()
         self.precision = np.zeros(3 * self.n_nodes)
         self.kappa_start, self.white_prior = 1.0, (0.0, 0.0)
+        self._sums: tuple[Array, Array, Array] | None = None
+        pixels = 2 * math.pi * radius * (self.inside + self.outside)
+        self.every = 5 if pixels > 5 * ENOUGH else 3 if pixels > 3 * ENOUGH else 1
         self.gather()
 
     def gather(self) -> None:
-        """Takes the pixels of the ring about the current silhouette."""
-        u_c, v_c, radius = self.shape[:3]
-        margin = 3.0 + 0.05 * radius
-        u, v, value = ring_pixels(
-            self.window, self.good, self.origin[0], self.origin[1], u_c, v_c, radius - self.inside - margin,
-            radius + self.outside + margin, self.scanner.p_u / self.p, self.scanner.p_v / self.p,
-        )  # fmt: skip
-        rim = self.coordinates(u, v)
-        wanted = (rim[:, 0] > -self.inside) & (rim[:, 0] < self.outside)
-        if u.size > MANY:
-            wanted &= (rim[:, 0] < NEAR) | ((u + v) % 2 == 0)
-        keep = np.flatnonzero(wanted)
-        # Neighbours in angle lie together in memory: the blocks of the normal matrix then stay in the nearest cache.
-        keep = keep[np.argsort(np.floor(np.arctan2(rim[keep, 5], rim[keep, 4]) * self.n_nodes), kind="stable")]
-        self.u, self.v, self.value = u[keep], v[keep], value[keep]
-        if self.u.size < 4 * self.n_nodes:
-            raise BallNotFoundError(f"only {self.u.size} usable pixels round the rim at ({u_c:.1f}, {v_c:.1f})")
+        """Takes the pixels of the ring about the current silhouette, one in `every`, and places the angular nodes."""
+        u, v, value, rim = self.ring(self.good, -self.inside, self.outside, self.every)
+        thin_from = NEAR if u.size > MANY and self.every == 1 else self.outside
+        self.u, self.v, self.value, self.rim, self.left, self.share, self.first = by_sector(
+            u, v, value, rim, -self.inside, self.outside, thin_from, self.n_nodes
+        )
         n = self.u.size
-        self.model, self.jacobian = np.zeros(n), np.zeros((n, 14))
-        self.left, self.share = np.zeros(n, np.int64), np.zeros(n)
-        self.weight = np.ones(n)
-        self.rim = np.ascontiguousarray(rim[keep])
+        if n < 4 * self.n_nodes:
+            at = f"({self.shape[0]:.1f}, {self.shape[1]:.1f})"
+            raise BallNotFoundError(f"only {n} usable pixels round the rim at {at}")
+        self.model, self.jacobian, self.weight = np.zeros(n), np.zeros((14, n)), np.ones(n)
+        self._sums = None
+
+    def ring(self, good: Array, low: float, high: float, every: int) -> tuple[Array, Array, Array, Array]:
+        """u, v, value (n,) and rim (6, n) of all pixels with s in [low, high], one in `every`, and of some beyond."""
+        scanner, radius = self.scanner, self.shape[2]
+        margin = 1.5 + 0.02 * (high - low) + cone_eccentricity(scanner, self.shape[:2], radius * self.gamma_px)
+        u, v, value = ring_pixels(
+            self.window, good, self.origin[0], self.origin[1], self.shape[0], self.shape[1], radius + low - margin,
+            radius + high + margin, scanner.p_u / self.p, scanner.p_v / self.p, every,
+        )  # fmt: skip
+        return u, v, value, self.coordinates(u, v)
 
     def coordinates(self, u: Array, v: Array) -> Array:
         s = self.shape
@@ -75,27 +81,36 @@ class Rim:
         )
 
     def evaluate(self, delta: Array | None = None) -> None:
-        """Model and Jacobian; after a small move `delta` of centre and radius the distances follow to first order."""
+        """Model and Jacobian after a move `delta` of centre and radius, where it is known.
+
+        Distances follow a small move to first order, and stay what they are without one (as after `gather`).
+        """
         s = self.shape
         if delta is None or np.abs(delta).max() > LINEAR:
             self.rim = self.coordinates(self.u, self.v)
-        else:
-            self.rim[:, 0] += (
-                self.rim[:, 1] * delta[0] + self.rim[:, 2] * delta[1] + self.rim[:, 3] * (delta[2] * self.gamma_px)
-            )
+        elif delta.any():
+            self.rim[0] += self.rim[1] * delta[0] + self.rim[2] * delta[1] + self.rim[3] * (delta[2] * self.gamma_px)
         table, first, step = edge_profile(s[3], s[4], s[2], -self.inside - 4.0, self.outside + 4.0)
         model_rows(
-            self.rim, self.nodes, self.white, table, first, step, s[3], self.gamma_px, self.box_u, self.box_v, s[5],
-            s[6], self.model, self.jacobian, self.left, self.share,
+            self.rim, self.left, self.share, self.nodes, self.white, table, first, step, s[3], self.gamma_px,
+            self.box_u, self.box_v, s[5], s[6], self.model, self.jacobian,
         )  # fmt: skip
+        self._sums = None
 
     @property
     def residual(self) -> Array:
         return self.value - self.model
 
+    def sums(self) -> tuple[Array, Array]:
+        """Normal matrix and right side of all parameters without priors; kept until the model or a weight changes."""
+        if self._sums is None or self._sums[0] is not self.weight:
+            both = normal_equations(self.value, self.model, self.jacobian, self.first, self.weight)
+            self._sums = (self.weight, *both)
+        return self._sums[1].copy(), self._sums[2].copy()
+
     def normal(self, active: npt.NDArray[np.intp]) -> tuple[Array, Array]:
         """Normal matrix and right side of the active parameters, priors included."""
-        N, g = normal_equations(self.value, self.model, self.jacobian, self.left, self.weight, self.n_nodes)
+        N, g = self.sums()
         if math.isfinite(self.shape[4]):
             N[4, 4] += 1.0 / self.kappa_start**2
             g[4] -= (self.shape[4] - self.kappa_start) / self.kappa_start**2
