@@ -25,13 +25,14 @@ FIRST_NODE = N_SHAPE + 1
 
 @njit(cache=True, fastmath=True)
 def model_rows(  # type: ignore[no-untyped-def]
-    rim, left, share, nodes, white, table, first, step, sigma, gamma_px, box_u, box_v, q_cos, q_sin, value, jacobian
+    rim, left, share, nodes, white, table, opaque, first, step, sigma, gamma_px, box_u, box_v, q_cos, q_sin, value,
+    jacobian,
 ):  # fmt: skip
     """Fills value (n,) and jacobian (14, n): the model and its derivatives at each pixel.
 
     rim: (6, n) of cone_coordinates; left, share: (n,) of by_sector.  nodes: (k, 3).  jacobian rows: shape (7), w, then
     a, b, c of the node on the left and of that on the right.  gamma_px: rad per px of radius.  box_u, box_v: variance
-    of a pixel's box across a rim normal to u or v, less their mean.
+    of a pixel's box across a rim normal to u or v, less their mean.  opaque: whether kappa is infinite.
     """
     n, k = rim.shape[1], nodes.shape[0]
     last = table.shape[0] - 2
@@ -44,12 +45,15 @@ def model_rows(  # type: ignore[no-untyped-def]
         O1 = table[j, 1] + f * (table[j + 1, 1] - table[j, 1])
         O2 = table[j, 2] + f * (table[j + 1, 2] - table[j, 2])
         R = table[j, 3] + f * (table[j + 1, 3] - table[j, 3])
-        R1 = table[j, 4] + f * (table[j + 1, 4] - table[j, 4])
-        R2 = table[j, 5] + f * (table[j + 1, 5] - table[j, 5])
-        Ok = table[j, 6] + f * (table[j + 1, 6] - table[j, 6])
-        Rk = table[j, 7] + f * (table[j + 1, 7] - table[j, 7])
         Q = table[j, 8] + f * (table[j + 1, 8] - table[j, 8])
-        Q1 = table[j, 9] + f * (table[j + 1, 9] - table[j, 9])
+        # Of an opaque ball R' = O, R'' = O' and Q' = R: half as much to look up.
+        R1, R2, Ok, Rk, Q1 = O, O1, 0.0, 0.0, R
+        if not opaque:
+            R1 = table[j, 4] + f * (table[j + 1, 4] - table[j, 4])
+            R2 = table[j, 5] + f * (table[j + 1, 5] - table[j, 5])
+            Ok = table[j, 6] + f * (table[j + 1, 6] - table[j, 6])
+            Rk = table[j, 7] + f * (table[j + 1, 7] - table[j, 7])
+            Q1 = table[j, 9] + f * (table[j + 1, 9] - table[j, 9])
         c, s = rim[4, i], rim[5, i]
         c2, s2 = c * c - s * s, 2.0 * c * s
         extra = 0.5 * (box_u * c * c + box_v * s * s + q_cos * c2 + q_sin * s2)
@@ -122,6 +126,19 @@ def normal_equations(image, value, jacobian, first, weight):  # type: ignore[no-
                 if p != q:
                     N[column[q], column[p]] += total
     return N, g
+
+
+@njit(cache=True)
+def with_priors(N, g, precision, pull, active):  # type: ignore[no-untyped-def]
+    """Rows and columns `active` of N and g, priors added: precision on the diagonal, pull on the right side."""
+    n = active.shape[0]
+    part, right = np.empty((n, n)), np.empty(n)
+    for i in range(n):
+        right[i] = g[active[i]] + pull[active[i]]
+        for j in range(n):
+            part[i, j] = N[active[i], active[j]]
+        part[i, i] += precision[active[i]]
+    return part, right
 
 
 @njit(cache=True)

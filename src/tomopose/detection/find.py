@@ -28,6 +28,8 @@ EQUAL = 0.75
 ROUND, FINE_ROUND = 0.08, 0.03
 """Deviation from a circle, in radii, that a ray may show on a coarse and on the fine level: a hexagon has 0.07."""
 FINALISTS = 4
+STILL = 0.002
+"""Move, px, below which a circle counts as fitted: the rays' edges are no better than a tenth."""
 PRIOR = 0.25
 """Width of the preference for the nominal radius, in log radius: loose, for magnification varies with the pose."""
 
@@ -265,8 +267,11 @@ def _robust_circle(x, y, good, start):  # type: ignore[no-untyped-def]
         determinant = xx * yy - xy * xy
         if not determinant > 1e-12 * total * total:
             return 0.0, 0.0, -1.0
+        before_x, before_y = cx, cy
         cx, cy = 0.5 * (yy * xs - xy * ys) / determinant, 0.5 * (xx * ys - xy * xs) / determinant
         radius = math.sqrt(max(ms - 2 * (cx * mx + cy * my) + cx * cx + cy * cy, 0.0))
+        if turn > 0 and abs(cx - before_x) + abs(cy - before_y) < STILL:
+            break
     return cx, cy, radius
 
 

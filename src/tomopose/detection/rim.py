@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from tomopose.detection.cholesky import solve
 from tomopose.detection.cone import by_sector, cone_angle, cone_coordinates, cone_eccentricity, ring_pixels
-from tomopose.detection.edges import FIRST_NODE, N_SHAPE, SHAPE, WHITE, model_rows, normal_equations
+from tomopose.detection.edges import FIRST_NODE, N_SHAPE, SHAPE, WHITE, model_rows, normal_equations, with_priors
 from tomopose.detection.profile import edge_profile
 from tomopose.errors import BallNotFoundError
 from tomopose.geometry.scanner import Scanner
@@ -92,8 +92,8 @@ class Rim:
             self.rim[0] += self.rim[1] * delta[0] + self.rim[2] * delta[1] + self.rim[3] * (delta[2] * self.gamma_px)
         table, first, step = edge_profile(s[3], s[4], s[2], -self.inside - 4.0, self.outside + 4.0)
         model_rows(
-            self.rim, self.left, self.share, self.nodes, self.white, table, first, step, s[3], self.gamma_px,
-            self.box_u, self.box_v, s[5], s[6], self.model, self.jacobian,
+            self.rim, self.left, self.share, self.nodes, self.white, table, math.isinf(s[4]), first, step, s[3],
+            self.gamma_px, self.box_u, self.box_v, s[5], s[6], self.model, self.jacobian,
         )  # fmt: skip
         self._sums = None
 
@@ -106,22 +106,22 @@ class Rim:
         if self._sums is None or self._sums[0] is not self.weight:
             both = normal_equations(self.value, self.model, self.jacobian, self.first, self.weight)
             self._sums = (self.weight, *both)
-        return self._sums[1].copy(), self._sums[2].copy()
+        return self._sums[1], self._sums[2]
 
     def normal(self, active: npt.NDArray[np.intp]) -> tuple[Array, Array]:
         """Normal matrix and right side of the active parameters, priors included."""
         N, g = self.sums()
+        precision, pull = np.zeros(g.size), np.zeros(g.size)
         if math.isfinite(self.shape[4]):
-            N[4, 4] += 1.0 / self.kappa_start**2
-            g[4] -= (self.shape[4] - self.kappa_start) / self.kappa_start**2
-        N[WHITE, WHITE] += self.white_prior[1]
-        g[WHITE] -= self.white_prior[1] * (self.white - self.white_prior[0])
-        i = np.arange(FIRST_NODE, FIRST_NODE + 3 * self.n_nodes)
+            precision[4] = 1.0 / self.kappa_start**2
+            pull[4] = precision[4] * (self.kappa_start - self.shape[4])
+        precision[WHITE], mean = self.white_prior[1], self.white_prior[0]
+        pull[WHITE] = precision[WHITE] * (mean - self.white)
         centre = np.zeros_like(self.nodes)
-        centre[:, 0] = np.mean(self.nodes[:, 0])
-        N[i, i] += self.precision
-        g[i] -= self.precision * (self.nodes - centre).ravel()
-        return N[np.ix_(active, active)], g[active]
+        centre[:, 0] = self.level
+        precision[FIRST_NODE:] = self.precision
+        pull[FIRST_NODE:] = self.precision * (centre - self.nodes).ravel()
+        return with_priors(N, g, precision, pull, active)
 
     def step(self, active: npt.NDArray[np.intp], *, careful: bool = False) -> float:
         """One Gauss-Newton step, shortened while it makes the fit worse if `careful`.
