@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import resource
 import subprocess
@@ -14,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -47,8 +49,7 @@ def canny_ellipse(image: np.ndarray, scanner: Scanner, origin: tuple[int, int]) 
     near = np.hypot(*(points - np.median(points, axis=0)).T)
     points = points[near > 0.5 * np.median(near)]
     model, _ = ransac(points, EllipseModel, 8, 1.0, max_trials=60, rng=1)
-    xc, yc, a, b, _ = model.params
-    return corrected(np.array([xc, yc]), min(a, b), scanner, origin)
+    return corrected(np.asarray(model.center), min(model.axis_lengths), scanner, origin)
 
 
 def opencv_ellipse(image: np.ndarray, scanner: Scanner, origin: tuple[int, int]) -> np.ndarray:
@@ -163,9 +164,11 @@ def speed(frames: int) -> None:
         cpu = time.process_time()
         detect(files, scene.scanner, predicted=predicted)
         tracked = (time.process_time() - cpu) / n
-        wall = time.perf_counter()
-        detect(files, scene.scanner, workers=2)
-        wall = (time.perf_counter() - wall) / n
+        with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
+            detect(files, scene.scanner, executor=pool)  # starts the processes and loads their kernels
+            wall = time.perf_counter()
+            detect(files, scene.scanner, executor=pool)
+            wall = (time.perf_counter() - wall) / n
     say("2048 x 2048 TIFF: read alone", f"{1e3 * read:.1f} ms CPU a frame")
     say("2048 x 2048 TIFF: read + find + fit", f"{1e3 * full:.1f} ms CPU = {full / read:.1f} x reading; "
         f"2 cores: {2 / full:.0f} a second by CPU time, {1 / wall:.0f} by the clock",
