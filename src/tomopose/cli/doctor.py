@@ -21,7 +21,8 @@ EXTRAS = {
     "sim": ("spekpy", "xraydb", "embreex", "trimesh", "manifold3d"),
     "dask": ("dask", "distributed"),
 }
-CORE = ("numpy", "scipy", "numba", "pydantic", "typer", "rich", "tifffile", "h5py", "pydicom", "jinja2", "plotly")
+CORE = ("numpy", "scipy", "numba", "pydantic", "typer", "rich", "tifffile", "imagecodecs", "h5py", "pydicom", "jinja2",
+        "plotly")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
