@@ -82,12 +82,13 @@ def _picture(volume: Volume, image: np.ndarray, across: str, up: str, **words: s
         "source": data_uri(png), "xref": "x", "yref": "y", "x": a_0, "y": u_1, "sizex": a_1 - a_0, "sizey": u_1 - u_0,
         "sizing": "stretch", "layer": "below",
     }
+    bare = {"showgrid": False, "zeroline": False}  # lines would lie over the picture
     return Figure(
         data=[{"type": "scatter", "x": [a_0, a_1], "y": [u_0, u_1], "mode": "markers", "marker": {"opacity": 0},
                "hoverinfo": "skip", "showlegend": False}],
         layout=layout(
-            images=[place], xaxis=axis(f"{across} / mm", range=[a_0, a_1], constrain="domain"),
-            yaxis=axis(f"{up} / mm", range=[u_0, u_1], scaleanchor="x", constrain="domain"),
+            images=[place], xaxis=axis(f"{across} / mm", range=[a_0, a_1], constrain="domain", **bare),
+            yaxis=axis(f"{up} / mm", range=[u_0, u_1], scaleanchor="x", constrain="domain", **bare),
         ),
         wide=False, height=420, **words,  # type: ignore[arg-type]
     )
