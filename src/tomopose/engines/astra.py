@@ -17,11 +17,12 @@ from tomopose.engines.protocol import (
     Availability,
     Limits,
     Weight,
-    box_lengths,
+    hold_to,
     require_images,
     require_returned,
     require_support,
     require_views,
+    view_lengths,
 )
 from tomopose.errors import EngineFailedError, InputError
 from tomopose.geometry.projection import ProjectionMatrices
@@ -122,15 +123,10 @@ class AstraEngine:
         share = self.transpose(np.ones_like(images, dtype=np.float32), views)
         seen = share > 1e-6 * share.max()
         into[seen] += np.float32(scale) * total[seen] / share[seen]
-        if self._support is not None:
-            into[~self._support] = 0.0
-        if nonnegative:
-            np.maximum(into, 0, out=into)
+        hold_to(into, self._support, nonnegative=nonnegative)
 
     def lengths(self, views: Sequence[int]) -> np.ndarray:
-        require_views(views, len(self.matrices))
-        size = self.matrices.n_u, self.matrices.n_v
-        return np.stack([box_lengths(self.matrices.P[j], self.grid, *size) for j in views]).astype(np.float32)
+        return view_lengths(self.matrices, self.grid, views)
 
 
 def availability() -> Availability:

@@ -119,6 +119,21 @@ def require_returned(images: np.ndarray, expected: tuple[int, ...], engine: str)
     return images
 
 
+def hold_to(volume: np.ndarray, support: np.ndarray | None, *, nonnegative: bool) -> None:
+    """In place: zero outside the support, and nothing below zero where that is asked for."""
+    if support is not None:
+        volume[~support] = 0.0
+    if nonnegative:
+        np.maximum(volume, 0, out=volume)
+
+
+def view_lengths(matrices: ProjectionMatrices, grid: VoxelGrid, views: Sequence[int]) -> np.ndarray:
+    """(m, n_v, n_u) float32, mm: lengths of the rays of some views inside the grid's box."""
+    require_views(views, len(matrices))
+    size = matrices.n_u, matrices.n_v
+    return np.stack([box_lengths(matrices.P[j], grid, *size) for j in views]).astype(np.float32)
+
+
 def box_lengths(P: Array, grid: VoxelGrid, n_u: int, n_v: int) -> np.ndarray:
     """(n_v, n_u), mm: lengths of the rays of one matrix (3, 4) inside the grid's box, plainly."""
     M_inv = np.linalg.inv(P[:, :3])

@@ -13,10 +13,11 @@ from tomopose.engines.protocol import (
     Availability,
     Limits,
     Weight,
-    box_lengths,
+    hold_to,
     require_images,
     require_support,
     require_views,
+    view_lengths,
 )
 from tomopose.geometry.projection import ProjectionMatrices, project
 from tomopose.volume import VoxelGrid
@@ -119,15 +120,10 @@ class ReferenceEngine:
         if weight == "mean":
             total /= np.maximum(count, 1)
         into += scale * total.reshape(self.grid.shape)
-        if self._support is not None:
-            into[~self._support] = 0.0
-        if nonnegative:
-            np.maximum(into, 0, out=into)
+        hold_to(into, self._support, nonnegative=nonnegative)
 
     def lengths(self, views: Sequence[int]) -> np.ndarray:
-        require_views(views, len(self.matrices))
-        size = self.matrices.n_u, self.matrices.n_v
-        return np.stack([box_lengths(self.matrices.P[j], self.grid, *size) for j in views]).astype(np.float32)
+        return view_lengths(self.matrices, self.grid, views)
 
 
 def availability() -> Availability:

@@ -17,11 +17,11 @@ from tomopose.engines.protocol import (
     Availability,
     Limits,
     Weight,
-    box_lengths,
     require_images,
     require_returned,
     require_support,
     require_views,
+    view_lengths,
 )
 from tomopose.errors import EngineFailedError, InputError
 from tomopose.geometry.projection import ProjectionMatrices
@@ -179,9 +179,7 @@ class RtkEngine:
         return require_returned(volume, self.empty().shape, self.name)
 
     def lengths(self, views: Sequence[int]) -> np.ndarray:
-        require_views(views, len(self.matrices))
-        size = self.matrices.n_u, self.matrices.n_v
-        return np.stack([box_lengths(self.matrices.P[j], self.grid, *size) for j in views]).astype(np.float32)
+        return view_lengths(self.matrices, self.grid, views)
 
 
 def availability() -> Availability:
