@@ -7,22 +7,38 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from tomopose.simulation.rays import LARGEST, trace
+from tomopose.geometry.frames import Frame
+from tomopose.geometry.transforms import RigidTransform
+from tomopose.simulation.attenuate import attenuated
+from tomopose.simulation.rays import LARGEST, Compiled, trace
+from tomopose.simulation.spectrum import Beam
+from tomopose.simulation.view import View, shadow_boxes
 
 BLOCK = 4
 """Between every fourth corner rays are interpolated where all around sees the same, smoothly."""
 EVEN = 5e-4
 """Largest third difference of transmission over coarse corners that counts as smooth."""
-OPAQUE = 30.0
-"""exp(-30) = 1e-13: nothing gets through."""
-STEPS = 128
-DECAY = np.exp(-np.arange(OPAQUE * STEPS + 1) / STEPS)
+
+def kernel_scene(compiled: Compiled | None, beam: Beam, view: View, T_FW: dict[Frame, RigidTransform]) -> Any:
+    """What the kernels take of a scene's solids (or of none), its beam and its view; boxes of shadows come last."""
+    parts: tuple[Any, ...]
+    if compiled is None:
+        none = np.empty(0, dtype=np.int64)
+        parts = (none, np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)), none, np.zeros(1, dtype=np.int64))
+        parts += (none, np.empty((0, 3)), np.empty(0))
+        boxes = np.empty((0, 2, 2))
+    else:
+        R, t, centre = compiled.in_world(T_FW)
+        parts = (compiled.kind, compiled.p, R, t, compiled.ops, compiled.first, compiled.material, centre)
+        parts += (compiled.radius,)
+        boxes = shadow_boxes(list(zip(compiled.frame, compiled.corners, strict=True)), view, T_FW)
+    return (*parts, beam.arrays, view.source, view.O, view.U, view.V, boxes)
 
 
 @njit(cache=True, nogil=True)
 def work_space(c: Any, depth: int) -> Any:
     """(T, S, L, active) for `trace`: each band of rows has its own."""
-    mu, boxes = c[10], c[15]
+    mu, boxes = c[9][1], c[14]
     return (
         np.empty((depth + 3, LARGEST)),
         np.empty((depth + 3, LARGEST + 1), dtype=np.int64),
@@ -32,38 +48,33 @@ def work_space(c: Any, depth: int) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def at(c: Any, work: Any, u: float, v: float) -> Any:
-    """(transmission, signature) at pixel coordinates (u, v)."""
-    kind, p, R, t, ops, first, material, centre, radius, w, mu, s, O, U, V, boxes = c
+def lengths(c: Any, work: Any, u: float, v: float) -> Any:
+    """The signature of the ray through pixel coordinates (u, v); its path lengths stand in work[2]."""
+    kind, p, R, t, ops, first, material, centre, radius, _, s, O, U, V, boxes = c
     T, S, L, active = work
     nothing = True
     for k in range(len(active)):
         active[k] = boxes[k, 0, 0] <= u <= boxes[k, 1, 0] and boxes[k, 0, 1] <= v <= boxes[k, 1, 1]
         nothing = nothing and not active[k]
     if nothing:
-        return 1.0, np.int64(0)
+        L[:] = 0.0
+        return np.int64(0)
     dx, dy, dz = (
         O[0] + u * U[0] + v * V[0] - s[0],
         O[1] + u * U[1] + v * V[1] - s[1],
         O[2] + u * U[2] + v * V[2] - s[2],
     )
     h = 1 / np.sqrt(dx * dx + dy * dy + dz * dz)
-    signature = trace(
+    return trace(
         kind, p, R, t, ops, first, material, centre, radius, active, s[0], s[1], s[2], h * dx, h * dy, h * dz, T, S, L
     )
-    if signature == 0:
-        return 1.0, signature
-    total = 0.0
-    for e in range(len(w)):
-        x = 0.0
-        for m in range(len(L)):
-            x += mu[e, m] * L[m]
-        if x < OPAQUE:
-            # exp(-x) from a table and three terms of the series, to 2e-10.
-            k = int(x * STEPS)
-            r = x - k / STEPS
-            total += w[e] * DECAY[k] * (1 - r * (1 - r * (0.5 - r / 6)))
-    return total, signature
+
+
+@njit(cache=True, nogil=True)
+def at(c: Any, work: Any, u: float, v: float) -> Any:
+    """(transmission, signature) at pixel coordinates (u, v)."""
+    signature = lengths(c, work, u, v)
+    return 1.0 if signature == 0 else attenuated(c[9], work[2]), signature
 
 
 @njit(cache=True, nogil=True)

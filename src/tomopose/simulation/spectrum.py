@@ -7,6 +7,7 @@ times cheaper per ray and wrong by less than `CONDENSED_ERROR`.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from tomopose.errors import EngineMissingError, InputError, ShapeError
+from tomopose.simulation.attenuate import tabulated
 from tomopose.simulation.materials import MATERIALS, Material, attenuation, table
 from tomopose.units import Array, float_array
 
@@ -103,6 +105,11 @@ class Beam:
     w: Array
     mu: Array
     error: float
+
+    @functools.cached_property
+    def arrays(self) -> tuple[Any, ...]:
+        """What `attenuated` takes."""
+        return self.w, self.mu, *tabulated(self.w, self.mu)
 
     def transmission(self, L: Any) -> Array:
         """Transmission (n,) of path lengths (n, m), mm."""
