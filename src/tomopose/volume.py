@@ -86,6 +86,12 @@ class VoxelGrid:
         """Fractional array indices (..., 3), (iz, iy, ix), of points (..., 3) in W, mm."""
         return ((np.asarray(x_W, dtype=np.float64) - self.origin) / self.spacing)[..., ::-1]
 
+    def same_as(self, other: VoxelGrid) -> bool:
+        """Whether both hold the same voxels, to a thousandth of one."""
+        near = 1e-3 * np.asarray(self.spacing)
+        apart = np.abs(self.corners - other.corners)
+        return self.shape == other.shape and bool((apart <= near).all())
+
     def slab(self, z_0: int, z_1: int) -> VoxelGrid:
         """The part of the grid with z_0 <= iz < z_1."""
         if not 0 <= z_0 < z_1 <= self.shape[0]:

@@ -11,7 +11,27 @@ from numpy.testing import assert_allclose
 import tomopose as tp
 from tomopose.cli.main import run
 from tomopose.geometry.projection import eq5_matrices
+from tomopose.simulation.materials import attenuation
 
+SCENE = """
+schema = "tomopose/scene/1"
+seed = 1
+detector = { snr = 100 }
+source = { voltage_kV = 100.0 }
+objects = [{ kind = "ball", t_mm = [0, 0, 0] }]
+mount = { angles_deg = [0, 0, 180], t_mm = [0, 0, 0] }
+poses = { grid = { n = 2 } }
+
+[scanner]
+d_SD_mm = 600
+d_SR_mm = 200
+p_u_mm = 1.4
+p_v_mm = 1.6
+u_0_px = 31
+v_0_px = 26
+n_u_px = 61
+n_v_px = 55
+"""
 CENTRE, RADIUS, MU = np.array([3.0, -2.0, 1.5]), 4.0, 0.05
 
 
@@ -83,3 +103,60 @@ def test_cgls_refuses_what_it_does_not_serve(scan, capsys):
     more = ["--images-are", "transmission", "--algorithm", "cgls", "--checkpoint", str(scan / "state")]
     assert run(words(scan, *more)) == 1
     assert "checkpoint" in capsys.readouterr().err
+
+
+def test_the_middle_of_the_volume_may_lie_anywhere(scan):
+    assert run(words(scan, "--images-are", "transmission", "--centre-mm", "3,-2,1.5", "--quiet")) == 0
+    volume = tp.read_volume(scan / "volume.h5")
+    assert_allclose(volume.grid.centre, CENTRE)
+    assert_allclose(np.argwhere(volume.values > MU / 2).mean(axis=0), 22.0, atol=0.2)
+
+
+def test_a_mask_keeps_the_rest_empty_and_must_lie_on_the_grid(scan, capsys):
+    grid = tp.VoxelGrid.cube(n=45, spacing=0.6)
+    allowed = np.zeros(grid.shape, dtype=np.float32)
+    allowed[10:-10, 10:-10, 10:-10] = 1
+    tp.write_volume(tp.Volume(values=allowed, grid=grid), scan / "allowed.h5")
+    assert run(words(scan, "--images-are", "transmission", "--mask", scan / "allowed.h5", "--quiet")) == 0
+    assert not tp.read_volume(scan / "volume.h5").values[allowed == 0].any()
+    tp.write_volume(tp.Volume(values=allowed, grid=tp.VoxelGrid.cube(n=45, spacing=0.61)), scan / "other.h5")
+    assert run(words(scan, "--images-are", "transmission", "--mask", scan / "other.h5", "--force")) == 1
+    assert "other.h5: its grid is not" in capsys.readouterr().err
+
+
+def test_bad_pixels_are_left_out(scan, capsys):
+    bad = np.zeros((55, 61), dtype=np.uint8)
+    bad[20, 30:32] = 1
+    for path in sorted((scan / "scan").iterdir()):
+        image = tp.open_images(path)[0].copy()
+        image[20, 30:32] = np.nan
+        tp.write_tiff(path, image, force=True)
+    assert run(words(scan, "--images-are", "transmission")) == 1
+    assert "NaN" in capsys.readouterr().err
+    tp.write_tiff(scan / "bad.tif", bad)
+    assert run(words(scan, "--images-are", "transmission", "--bad-pixels", scan / "bad.tif", "--quiet")) == 0
+    assert np.isfinite(tp.read_volume(scan / "volume.h5").values).all()
+
+
+def test_beam_hardening_of_a_known_material_is_taken_out(scan, capsys):
+    scene = scan / "scene.toml"
+    scene.write_text(SCENE, encoding="utf-8")
+    beam = tp.simulate(tp.read_scene(scene))
+    mu = attenuation("Al", beam.spectrum.energy, materials=beam.materials)
+    weight = beam.spectrum.weight / beam.spectrum.weight.sum()
+    for path in sorted((scan / "scan").iterdir()):
+        chord = -np.log(tp.open_images(path)[0]) / MU
+        tp.write_tiff(path, (np.exp(-chord[..., None] * mu) @ weight).astype(np.float32), force=True)
+
+    def spread(*more):
+        assert run(words(scan, "--images-are", "transmission", "--force", "--quiet", *more)) == 0
+        volume = tp.read_volume(scan / "volume.h5")
+        z, y, x = np.meshgrid(*(np.arange(n) for n in volume.grid.shape), indexing="ij")
+        r = np.linalg.norm(volume.grid.points(np.stack([z, y, x], axis=-1)) - CENTRE, axis=-1)
+        return volume.values[r < 0.4 * RADIUS].mean() / volume.values[(r > 0.6 * RADIUS) & (r < 0.75 * RADIUS)].mean()
+
+    cupped = spread()
+    flat = spread("--scene", scene, "--material", "Al", "--thickness-mm", 8)
+    assert abs(flat - 1) < 0.4 * abs(cupped - 1)
+    assert run(words(scan, "--images-are", "transmission", "--force", "--material", "Al")) == 2
+    assert "--scene" in capsys.readouterr().err

@@ -73,8 +73,14 @@ def test_cgls_lowers_the_residual_every_time(tilted):
         for k in (1, 3, 8)
     ]
     assert residual[0] > residual[1] > residual[2]
-    truth, _ = truth_of(tilted[1], tilted[0], algorithm="cgls", iterations=12, consistency="off")
+    truth, plain = truth_of(tilted[1], tilted[0], algorithm="cgls", iterations=12, consistency="off")
     assert truth.centre_error.max() < 0.04
+    mask = np.zeros(GRID.shape, dtype=bool)
+    mask[4:-4, 4:-4, 4:-4] = True
+    truth, masked = truth_of(tilted[1], tilted[0], algorithm="cgls", iterations=12, consistency="off", mask=mask)
+    assert truth.centre_error.max() < 0.04
+    assert not masked.values[~mask].any()
+    assert plain.values[~mask].any()
 
 
 def test_nonnegative_and_mask_hold(tilted):

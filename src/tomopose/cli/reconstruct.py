@@ -11,10 +11,13 @@ from tomopose.cli.common import (
     OK,
     DarkOption,
     DaskOption,
+    DatasetOption,
     FlatOption,
     ForceOption,
     JsonOption,
     QuietOption,
+    RawOption,
+    RowsOption,
     Say,
     arguments,
     names,
@@ -41,12 +44,42 @@ def grid_size(text: str) -> tuple[int, int, int]:
     return z, y, x
 
 
+def point(text: str) -> tuple[float, float, float]:
+    """`X,Y,Z` as numbers."""
+    try:
+        x, y, z = (float(part) for part in names(text))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not X,Y,Z", param_hint="--centre-mm") from None
+    return x, y, z
+
+
+def polynomial(scene: Path | None, material: str | None, thickness: float | None) -> tuple[float, ...]:
+    """Coefficients that take a scene's polychromatic line integrals through a material to monochromatic ones."""
+    if scene is None and material is None and thickness is None:
+        return ()
+    if scene is None or material is None or thickness is None:
+        raise typer.BadParameter(
+            "beam hardening needs all three of --scene, --material and --thickness-mm", param_hint="--material"
+        )
+    import tomopose as tp
+    from tomopose.reconstruction import beam_hardening_polynomial
+    from tomopose.simulation.materials import attenuation
+
+    run = tp.simulate(tp.read_scene(scene))
+    energy = run.spectrum.energy
+    mu = attenuation(material, energy, materials=run.materials)
+    return beam_hardening_polynomial(energy, run.spectrum.weight, mu, thickness_mm=thickness)
+
+
 def reconstruct(
     matrices: Annotated[Path, typer.Option("--matrices", help="matrices.npz of the scan.")],
     images: Annotated[str, typer.Option("--images", help="Folder, glob or multi-page file of the scan's images.")],
     voxel: Annotated[float, typer.Option("--voxel-mm", help="Voxel side, mm.")],
     size: Annotated[str, typer.Option("--size", help="Voxels along each axis, N or NX,NY,NZ.")],
     out: Annotated[Path, typer.Option("--out", help="volume.h5 (also .nrrd, .mhd, .tif).")],
+    centre: Annotated[
+        str, typer.Option("--centre-mm", help="Middle of the volume in W, X,Y,Z.")
+    ] = "0,0,0",
     images_are: Annotated[
         str | None, typer.Option("--images-are", help="counts, transmission or line-integrals; never guessed.")
     ] = None,
@@ -55,6 +88,12 @@ def reconstruct(
     ] = None,
     dark: DarkOption = None,
     flat: FlatOption = None,
+    scanner: Annotated[
+        Path | None, typer.Option("--scanner", help="scanner.json, for the row order and size of the image files.")
+    ] = None,
+    dataset: DatasetOption = None,
+    rows: RowsOption = None,
+    raw: RawOption = None,
     engine: Annotated[str, typer.Option("--engine", help="auto, cpu, rtk, astra or reference.")] = "auto",
     algorithm: Annotated[
         str, typer.Option("--algorithm", help="fdk+sart, sart, ossart, fdk, fdk-preview or cgls.")
@@ -63,9 +102,27 @@ def reconstruct(
     iterations: Annotated[int | None, typer.Option("--iterations", min=1, help="Sweeps over all views.")] = None,
     relaxation: Annotated[float, typer.Option("--relaxation", help="Above 0 and below 2.")] = 0.8,
     order: Annotated[str, typer.Option("--order", help="golden, sequential or random.")] = "golden",
+    seed: Annotated[int, typer.Option("--seed", help="Of the random order.")] = 0,
     subset_size: Annotated[int | None, typer.Option("--subset-size", min=1, help="Views in one update.")] = None,
     ring_width: Annotated[
         int | None, typer.Option("--ring-width", min=1, help="Even out pixels that differ from this many neighbours.")
+    ] = None,
+    bad_pixels: Annotated[
+        Path | None, typer.Option("--bad-pixels", help="Image that is not 0 where a pixel is to be left out.")
+    ] = None,
+    exclude: Annotated[
+        bool, typer.Option("--exclude-invalid", help="Leave NaN and dark pixels out of their view, not refuse them.")
+    ] = False,
+    scene: Annotated[
+        Path | None, typer.Option("--scene", help="scene.toml whose source and detector made the images, with "
+                                  "--material: beam hardening is taken out.")
+    ] = None,
+    material: Annotated[str | None, typer.Option("--material", help="What the object is made of.")] = None,
+    thickness: Annotated[
+        float | None, typer.Option("--thickness-mm", help="Longest way through the object.")
+    ] = None,
+    mask: Annotated[
+        Path | None, typer.Option("--mask", help="Volume on the same grid that is not 0 where there may be material.")
     ] = None,
     nonnegative: Annotated[bool, typer.Option("--nonnegative", help="Keep attenuation at 0 or above.")] = False,
     memory: Annotated[float | None, typer.Option("--memory-gib", help="Keep within this much memory.")] = None,
@@ -90,36 +147,47 @@ def reconstruct(
     import numpy as np
 
     import tomopose as tp
-    from tomopose.cli.job import executor_of, image_source
+    from tomopose.cli.job import executor_of, image_source, open_for
+    from tomopose.errors import InputError
     from tomopose.files import atomic_file, require_absent
     from tomopose.provenance import provenance
     from tomopose.reconstruction import PAPER
     from tomopose.report import volume_pictures, volume_report, write_report
 
     say = Say(json=as_json, quiet=quiet)
-    shape = grid_size(size)
+    grid = tp.VoxelGrid(shape=grid_size(size), spacing=voxel, centre=np.array(point(centre)))
+    coefficients = polynomial(scene, material, thickness)
     target = require_absent(out, force=force)
     shown = {name: require_absent(out.with_name(f"{out.stem}_{name}.png"), force=force) for name in PICTURES}
     page = require_absent(out.with_name(f"{out.stem}.html"), force=force)
     P = tp.read_matrices(matrices)
-    stack = tp.open_images(image_source(images), dark=dark, flat=flat)
-    for warning in stack.warnings:
-        say.note(f"note: {warning}")
+    known = None if scanner is None else tp.read_scanner(scanner)
+    stack = open_for(
+        say, image_source(images), known, None, dark=dark, flat=flat, dataset=dataset, rows=rows, raw=raw
+    )
+    bad = None if bad_pixels is None else tp.open_images(bad_pixels, rows=stack.rows)[0] != 0
+    support = None
+    if mask is not None:
+        allowed = tp.read_volume(mask)
+        if not allowed.grid.same_as(grid):
+            raise InputError(f"{mask}: its grid is not that of the volume to be made ({size} voxels of {voxel:g} mm)")
+        support = allowed.values != 0
     choice: dict[str, Any] = {
         "algorithm": algorithm, "iterations": iterations, "relaxation": relaxation, "order": order,
-        "subset_size": subset_size,
+        "subset_size": subset_size, "seed": seed,
     }
     if paper:
-        choice = dict(PAPER)
+        choice = {**PAPER, "seed": seed}
     with say.progress("reconstructing") as progress, executor_of(dask) as client:
         volume = tp.reconstruct(
-            stack, P, tp.VoxelGrid(shape=shape, spacing=voxel), engine=engine, nonnegative=nonnegative,
-            ring_width=ring_width, white=white,
+            stack, P, grid, engine=engine, nonnegative=nonnegative, ring_width=ring_width, white=white, mask=support,
+            bad_pixels=bad, invalid="exclude" if exclude else "error", beam_hardening=coefficients,
             images_are="transmission" if flat is not None and images_are is None else images_are,
             memory_gib=memory, scratch=scratch, checkpoint=checkpoint, progress=progress, client=client, **choice,
         )
     made = provenance(
-        inputs=[matrices], arguments=arguments(voxel_mm=voxel, size=size, engine=engine, **choice)
+        inputs=[path for path in (matrices, scanner, bad_pixels, mask, scene) if path is not None],
+        arguments=arguments(voxel_mm=voxel, size=size, centre_mm=centre, engine=engine, **choice),
     )
     volume = replace(volume, provenance=made)
     tp.write_volume(volume, target, force=force)
@@ -129,9 +197,9 @@ def reconstruct(
     write_report(page, volume_report(volume))
     residual = None if volume.view_residual is None else float(np.median(volume.view_residual))
     say.result(
-        {"out": out.name, "shape_zyx": list(shape), "voxel_mm": voxel, "median_view_residual": residual,
+        {"out": out.name, "shape_zyx": list(grid.shape), "voxel_mm": voxel, "median_view_residual": residual,
          "notes": list(volume.notes), "settings": dict(volume.settings)},
-        [f"{out}: {shape[2]} x {shape[1]} x {shape[0]} voxels of {voxel:g} mm; pictures and {page.name} beside it",
+        [f"{out}: {' x '.join(map(str, grid.n_xyz))} voxels of {voxel:g} mm; pictures and {page.name} beside it",
          *([] if residual is None else [f"  residual of a view's reprojection, median: {residual:.3g}"]),
          *(f"  note: {note}" for note in volume.notes)],
     )

@@ -36,7 +36,7 @@ from tomopose.volume import Volume, VoxelGrid
 Algorithm = Literal["fdk+sart", "sart", "ossart", "fdk", "fdk-preview", "cgls"]
 ALGORITHMS = ("fdk+sart", "sart", "ossart", "fdk", "fdk-preview", "cgls")
 OSSART_SUBSET = 5
-PAPER = {"algorithm": "sart", "iterations": 1, "relaxation": 0.8, "order": "random"}
+PAPER: dict[str, Any] = {"algorithm": "sart", "iterations": 1, "relaxation": 0.8, "order": "random"}
 """As in Butzhammer et al., Meas. Sci. Technol. 34 (2023) 015403, sec. 6.2: one iteration of SART, relaxation 0.8.
 
 The paper does not say in which order the views were taken.  From zero, one sweep in random order left ball centres
@@ -301,10 +301,8 @@ def solve_cgls(
     iterations: int, progress: Callable[[int, int], None] | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """CGLS in one piece, and the residual of each view."""
-    if support is not None:
-        raise InputError("CGLS knows no support mask; use SART")
     engine = make_engine(name, scan.matrices, grid, **options)
-    x = cgls(engine, scan, iterations=iterations, progress=progress)
+    x = cgls(engine, scan, iterations=iterations, support=support, progress=progress)
     residual = np.empty(len(scan))
     for j in range(len(scan)):
         p = scan[j].astype(np.float64)

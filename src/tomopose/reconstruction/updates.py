@@ -127,16 +127,23 @@ def view_residuals(field: Field, scan: LineIntegrals, samples: Samples) -> np.nd
 
 
 def cgls(
-    engine: Any, scan: LineIntegrals, *, iterations: int, progress: Callable[[int, int], None] | None = None
+    engine: Any, scan: LineIntegrals, *, iterations: int, support: np.ndarray | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Any:
     """Least squares |p - A x|^2 by conjugate gradients (Hestenes and Stiefel), from zero; A' is the engine's transpose.
 
-    Holds two volumes, the measured and one reprojected scan in memory beside the result.
+    support: bool [z, y, x], the voxels that x may fill.  Holds two volumes, the measured and one reprojected scan in
+    memory beside the result.
     """
     views = list(range(len(scan)))
     residual = np.stack([scan[j] for j in views])
     x = engine.empty()
-    gradient = engine.transpose(residual, views)
+
+    def transpose() -> Any:
+        all_voxels = engine.transpose(residual, views)
+        return all_voxels if support is None else engine.put(np.where(support, engine.values(all_voxels), 0))
+
+    gradient = transpose()
     direction = gradient.copy()
     size = float(np.vdot(gradient, gradient))
     for k in range(iterations):
@@ -146,7 +153,7 @@ def cgls(
         alpha = size / float((projected.astype(np.float64) ** 2).sum())
         x += np.float32(alpha) * direction
         residual -= np.float32(alpha) * projected
-        gradient = engine.transpose(residual, views)
+        gradient = transpose()
         new = float(np.vdot(gradient, gradient))
         direction *= np.float32(new / size)
         direction += gradient
