@@ -122,7 +122,8 @@ def serial_from_document(document: Mapping[str, Any], where: str) -> SerialRobot
     confirmed = document.get("units") == "confirmed"
     made = tuple(_joint(j, f"{where}: joint {k + 1}", confirmed) for k, j in enumerate(joints))
     reach = float(sum(abs(j.a) + abs(j.d) for j in made))
-    if not confirmed and not SMALLEST_REACH_MM <= reach <= LARGEST_REACH_MM:
+    # Axes that meet in one point, as a C-arm's do, have no length that could be in a wrong unit.
+    if reach and not confirmed and not SMALLEST_REACH_MM <= reach <= LARGEST_REACH_MM:
         meant = "metres" if reach < SMALLEST_REACH_MM else "micrometres"
         raise UnitError(f"{where}: the links add up to {reach:.4g} mm; these look like {meant}; {CONFIRM}")
     convention = document.get("convention")
