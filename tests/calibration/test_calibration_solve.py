@@ -133,6 +133,15 @@ def test_rotations_about_one_axis_are_refused_and_the_axis_named(scanner, T_HT):
     assert len(caught.value.singular_values) == 9
 
 
+@pytest.mark.parametrize("noisy", [False, True])
+def test_poses_that_only_turn_about_one_point_hold_no_length(scanner, T_HT, rng, noisy):
+    poses = PoseSequence.from_table(np.zeros((60, 3)), rng.uniform(-40, 40, (60, 3)), alpha=np.zeros(60))
+    real = replace(poses, T_MH=replace(poses.T_MH, t=0.05 * noisy * rng.standard_normal((60, 3))))
+    observed = observe(scanner, real, T_HT, np.array([8.0, -6.0, 5.0]))
+    with pytest.raises(NotObservableError, match="do not determine"):
+        calibrate(scanner, poses, observed)
+
+
 def test_freeing_what_the_poses_cannot_tell_is_refused(scanner, T_HT):
     poses = grid_poses()
     observed = observe(scanner, poses, T_HT, np.ones(3))

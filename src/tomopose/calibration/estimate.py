@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.fit import Fit, blocks, jacobian, minimise, tangent_names
+from tomopose.calibration.fit import Fit, blocks, jacobian, minimise, residuals, tangent_names, whitened2
 from tomopose.calibration.initial import closed_form, other_starts, ray_equations
 from tomopose.calibration.observability import cure, unobservable_directions
 from tomopose.calibration.parameters import UNITS, FreeParameters, free_parameters
@@ -18,16 +18,19 @@ from tomopose.calibration.uncertainty import inverse_information, significant, w
 from tomopose.errors import InputError, NotConvergedError, NotObservableError
 from tomopose.units import Array
 
+COLLAPSED = 1e-3
+"""A ball nearer to the source than this part of d_SR is none that anybody imaged."""
+
 POOR_CHI2, POOR_SHARE = 9.0, 2e-3
 """An optimum is suspected to be local when its median residual is 3 sigma and 0.2 % of the centres' spread."""
 
 
 def _median_residual(problem: Problem, free: FreeParameters, fit: Fit) -> tuple[float, float]:
-    r = problem.x_D - blocks(problem, free, fit).x_D
-    if not np.isfinite(r).all():
-        return np.inf, np.inf
-    d2 = ((problem.W @ r[:, :, None])[..., 0] ** 2).sum(axis=1)
-    return float(np.median(d2)), float(np.median(np.linalg.norm(r, axis=1)))
+    r = residuals(problem, free, fit)
+    d2 = whitened2(problem, r)
+    # a centre that is not finite makes the median so too
+    return (float(np.median(d2)), float(np.sqrt(np.median((r * r).sum(axis=1))))) if np.isfinite(d2).all() else (
+        np.inf, np.inf)
 
 
 def _poor(problem: Problem, free: FreeParameters, fit: Fit) -> tuple[bool, float]:
@@ -38,12 +41,12 @@ def _poor(problem: Problem, free: FreeParameters, fit: Fit) -> tuple[bool, float
 
 def best_fit(problem: Problem, free: FreeParameters) -> Fit:
     """The optimum of all rows, from the closed form, or the best of the optima from many starts where it looks poor."""
-    n, d = ray_equations(problem)
+    rays = ray_equations(problem)
     held = free_parameters(problem.scanners, fix=tuple(UNITS))
-    fit = minimise(problem, held, closed_form(problem, n, d))
+    fit = minimise(problem, held, closed_form(problem, rays))
     poor, measure = _poor(problem, held, fit)
     if poor:
-        for start in other_starts(problem, n, d):
+        for start in other_starts(problem, rays):
             other = minimise(problem, held, start, iterations=30)
             still_poor, other_measure = _poor(problem, held, other)
             if other_measure < measure or not np.isfinite(measure):
@@ -74,6 +77,23 @@ def require_observable(problem: Problem, free: FreeParameters, J: Array) -> None
         )
 
 
+def require_length(problem: Problem, fit: Fit) -> None:
+    """NotObservableError where the ball has fallen into the source: without any length an optimum may shrink at will.
+
+    Poses that only turn about one point, as those of an isocentric C-arm do, hold none while the table stands still.
+    """
+    scanner = problem.scanners[problem.run[0]]
+    source = (scanner.T_WS @ scanner.T_TW(float(problem.alpha[0]))).inv.t
+    ball = fit.R_HT @ (problem.R_MH[0] @ fit.t[problem.ball[0]] + problem.t_MH[0]) + fit.t_HT
+    if np.linalg.norm(ball - source) < COLLAPSED * scanner.d_SR:
+        direction = "the size of t_HT and t: every distance from the source may be shrunk alike"
+        raise NotObservableError(
+            f"the poses do not determine the calibration: {direction}; add poses that translate, another table angle, "
+            "or known distances between balls with the manipulator's geometry",
+            direction=direction,
+        )
+
+
 @dataclass(frozen=True, kw_only=True)
 class Solution:
     """A robust fit with all that the later steps need.
@@ -98,6 +118,7 @@ class Solution:
     def fit(self) -> Fit:
         return self.robust.fit
 
+
 def solve(
     problem: Problem, free: FreeParameters, *, robust: bool = True, start: Fit | None = None,
     noise: PoseNoise | None = None,
@@ -106,6 +127,7 @@ def solve(
     first = best_fit(problem, free) if start is None else minimise(problem, free, start)
     if not np.isfinite(first.chi2):
         raise NotConvergedError("no start led to an optimum with the ball in front of the source in every pose")
+    require_length(problem, first)
     everything = np.ones(len(problem), dtype=bool)
     # judged by detection noise alone: pose noise as large as a mistake would hide behind "not observable"
     if noise is None:
