@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.kernel import CONVERGED, levenberg_marquardt
+from tomopose.calibration.kernel import CONVERGED, centres, levenberg_marquardt
 from tomopose.calibration.parameters import FreeParameters, adjusted_scanners, translation_scale
 from tomopose.calibration.problem import Problem
 from tomopose.calibration.residuals import ProjectionBlocks, projection_blocks
@@ -57,6 +57,22 @@ def minimise(
     )
     U, _, V = np.linalg.svd(R)
     return Fit(R_HT=U @ V, t_HT=t_HT, t=t, delta=delta, chi2=float(chi2), converged=status == CONVERGED, N=N)
+
+
+def residuals(problem: Problem, free: FreeParameters, fit: Fit) -> Array:
+    """(n, 2) px: observed minus calculated centres; NaN where a ball would be behind the source."""
+    return problem.x_D - centres(
+        problem.R_MH, problem.t_MH, problem.alpha, problem.run, problem.ball, problem.s_0, free.cols, free.col_run,
+        free.factor, np.ascontiguousarray(fit.R_HT), fit.t_HT, fit.t, fit.delta,
+    )
+
+
+def whitened2(problem: Problem, r: Array) -> Array:
+    """(n,) squared length of residuals r (n, 2) px in standard deviations of the centres."""
+    W = problem.W
+    a = W[:, 0, 0] * r[:, 0] + W[:, 0, 1] * r[:, 1]
+    b = W[:, 1, 0] * r[:, 0] + W[:, 1, 1] * r[:, 1]
+    return a * a + b * b
 
 
 def blocks(problem: Problem, free: FreeParameters, fit: Fit) -> ProjectionBlocks:

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from tomopose.calibration.estimate import best_fit
-from tomopose.calibration.fit import Fit, blocks, minimise
-from tomopose.calibration.initial import closed_form, other_starts, ray_equations
+from tomopose.calibration.fit import Fit, minimise, residuals
+from tomopose.calibration.initial import Rays, closed_form, other_starts, ray_equations
 from tomopose.calibration.parameters import UNITS, FreeParameters, free_parameters
 from tomopose.calibration.problem import Problem, pair
 from tomopose.calibration.rivals import RIVALS, Rival
@@ -107,17 +107,17 @@ class Diagnosis:
 
 
 def _rms(problem: Problem, fit: Fit, free: FreeParameters) -> float:
-    r = problem.x_D - blocks(problem, free, fit).x_D
+    r = residuals(problem, free, fit)
     return float(np.sqrt((r**2).sum(axis=1).mean()))
 
 
-def _fit_rival(problem: Problem, rays: tuple[Array, Array], free: FreeParameters, held: FreeParameters,
+def _fit_rival(problem: Problem, rays: Rays, free: FreeParameters, held: FreeParameters,
                starts: int) -> Fit:
-    fit = minimise(problem, held, closed_form(problem, *rays), iterations=RIVAL_ITERATIONS)
+    fit = minimise(problem, held, closed_form(problem, rays), iterations=RIVAL_ITERATIONS)
     if not np.isfinite(fit.chi2):
         # mirrored data have no closed form in front of the source; the residual they leave is still worth knowing
         others = (minimise(problem, held, start, iterations=RIVAL_ITERATIONS)
-                  for start in itertools.islice(other_starts(problem, *rays), starts))
+                  for start in itertools.islice(other_starts(problem, rays), starts))
         fit = minimise(problem, held, min((fit, *others), key=lambda one: one.chi2))
     return minimise(problem, free, fit, iterations=RIVAL_ITERATIONS) if len(free) else fit
 

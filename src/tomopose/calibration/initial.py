@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,22 +24,37 @@ MOVED_SOURCE = 1e-3
 """The source counts as moved in T when it moves by more than this part of its distance."""
 
 
-def ray_equations(problem: Problem) -> tuple[Array, Array]:
-    """n (k, 2, 3), d (k, 2) with n . x_T + d = 0 for every pixel; divided by the depth, so that they count pixels."""
-    n = np.empty((len(problem), 2, 3))
-    d = np.empty((len(problem), 2))
+@dataclass(frozen=True, kw_only=True)
+class Rays:
+    """n (k, 2, 3), d (k, 2): n . x_T + d = 0 for every pixel, divided by the depth so that they count pixels;
+    source (3,): where the source stands in T in the first pose, mm."""
+
+    n: Array
+    d: Array
+    source: Array
+
+
+def ray_equations(problem: Problem) -> Rays:
+    """The two planes through the source in which each observed centre lies."""
+    n, d = np.empty((len(problem), 2, 3)), np.empty((len(problem), 2))
+    source = np.zeros(3)
     for r, scanner in enumerate(problem.scanners):
-        mine = problem.run == r
+        alone = len(problem.scanners) == 1
+        mine = slice(None) if alone else problem.run == r
         alpha, which = np.unique(problem.alpha[mine], return_inverse=True)
-        P = (scanner.P_S @ (scanner.T_WS.matrix @ scanner.T_TW(alpha).matrix))[which.reshape(-1)]
+        T_WS, T_TW = scanner.T_WS.matrix, scanner.T_TW(alpha)
+        P = (scanner.P_S @ T_WS @ T_TW.matrix)[which.reshape(-1)]
         rows = P[:, :2] - problem.x_D[mine][:, :, None] * P[:, 2:]
         n[mine], d[mine] = rows[:, :, :3] / scanner.d_SR, rows[:, :, 3] / scanner.d_SR
-    return n, d
+        if r == problem.run[0]:
+            first = int(which.reshape(-1)[0])
+            at_W = -T_WS[:3, :3].T @ T_WS[:3, 3]
+            source = T_TW.R[first].T @ (at_W - T_TW.t[first])
+    return Rays(n=n, d=d, source=source)
 
 
-def _solve(A: Array, b: Array) -> Array:
-    """Least squares by normal equations, directions without information left at zero."""
-    N, g = A.T @ A, A.T @ b
+def _solve(N: Array, g: Array) -> Array:
+    """N^-1 g, directions without information left at zero."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
     value, V = np.linalg.eigh(N * scale[:, None] * scale)
     good = value > RANK_TOLERANCE * value[-1]
@@ -46,48 +62,56 @@ def _solve(A: Array, b: Array) -> Array:
     return scale * (V @ ((V.T @ (scale * g)) / value[good]))
 
 
-def positions_for(problem: Problem, R_HT: Array, n: Array, d: Array) -> tuple[Array, Array]:
+def positions_for(problem: Problem, R_HT: Array, rays: Rays) -> tuple[Array, Array]:
     """t_HT (3,) and t (balls, 3) that fit best under a given R_HT: linear."""
     k, n_b = len(problem), len(problem.ball_ids)
-    nR = n @ R_HT
-    A = np.zeros((k, 2, 3 + 3 * n_b))
-    A[:, :, :3] = n
-    column = 3 + 3 * problem.ball[:, None] + np.arange(3)
-    np.put_along_axis(A, np.broadcast_to(column[:, None, :], (k, 2, 3)), nR @ problem.R_MH, axis=2)
-    b = -d - (nR @ problem.t_MH[:, :, None])[..., 0]
-    x = _solve(A.reshape(2 * k, -1), b.ravel())
+    nR = rays.n @ R_HT
+    A: Array = np.zeros((k, 2, 3 + 3 * n_b))
+    A[:, :, :3] = rays.n
+    if n_b == 1:
+        A[:, :, 3:] = nR @ problem.R_MH
+    else:
+        column = 3 + 3 * problem.ball[:, None] + np.arange(3)
+        np.put_along_axis(A, np.broadcast_to(column[:, None, :], (k, 2, 3)), nR @ problem.R_MH, axis=2)
+    b = -rays.d - (nR @ problem.t_MH[:, :, None])[..., 0]
+    A = A.reshape(2 * k, -1)
+    x = _solve(A.T @ A, A.T @ b.ravel())
     return x[:3], x[3:].reshape(n_b, 3)
 
 
-def resection(problem: Problem, t: Array, n: Array, d: Array) -> Array:
+def resection(problem: Problem, t: Array, rays: Rays) -> Array:
     """R_HT (3, 3) from the linear resection with the balls taken at t (balls, 3).
 
     Written from one source position s, n . (A y + c) + l (n . s + d) = 0 with c = t_HT - l s is homogeneous in
     (A, c, l); l drops out where the source keeps its place in T, that is, while the table stands still.  A is a
     rotation but for its scale and sign, which det A > 0 settles: the mirrored solution is never taken.
     """
-    y = np.einsum("kij,kj->ki", problem.R_MH, t[problem.ball]) + problem.t_MH
+    n = rays.n
+    y = (problem.R_MH @ t[problem.ball][:, :, None])[..., 0] + problem.t_MH
     k = len(problem)
-    scanner = problem.scanners[problem.run[0]]
-    source = (scanner.T_WS @ scanner.T_TW(float(problem.alpha[0]))).inv.t
-    rest = n @ source + d
-    columns = [(n[:, :, :, None] * y[:, None, None, :]).reshape(k, 2, 9), n]
-    if np.abs(rest).max() > MOVED_SOURCE * np.linalg.norm(source) * np.abs(n).max():
-        columns.append(rest[:, :, None])
-    A = np.concatenate(columns, axis=2).reshape(2 * k, -1)
-    scale = 1.0 / np.sqrt(np.maximum(np.einsum("ij,ij->j", A, A), 1e-300))
-    N = (A.T @ A) * scale[:, None] * scale
-    x = scale * np.linalg.eigh(N)[1][:, 0]
-    U, _, V = np.linalg.svd(x[:9].reshape(3, 3) * (np.sign(np.linalg.det(x[:9].reshape(3, 3))) or 1.0))
-    return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ V))]) @ V
+    rest = n @ rays.source + rays.d
+    moved = np.abs(rest).max() > MOVED_SOURCE * np.linalg.norm(rays.source) * np.abs(n).max()
+    A: Array = np.empty((k, 2, 13 if moved else 12))
+    A[:, :, :9] = (n[:, :, :, None] * y[:, None, None, :]).reshape(k, 2, 9)
+    A[:, :, 9:12] = n
+    if moved:
+        A[:, :, 12] = rest
+    A = A.reshape(2 * k, -1)
+    N = A.T @ A
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
+    x = scale * np.linalg.eigh(N * scale[:, None] * scale)[1][:, 0]
+    B = x[:9].reshape(3, 3)
+    U, _, V = np.linalg.svd(-B if np.linalg.det(B) < 0 else B)
+    # of (nearly) flat data the sign of det may still be lost
+    return U @ V if np.linalg.det(U @ V) > 0 else U @ np.diag([1.0, 1.0, -1.0]) @ V
 
 
-def closed_form(problem: Problem, n: Array, d: Array) -> tuple[Array, Array, Array]:
+def closed_form(problem: Problem, rays: Rays) -> tuple[Array, Array, Array]:
     """R_HT, t_HT, t by the alternation of the two linear steps."""
     t = np.zeros((len(problem.ball_ids), 3))
     for _ in range(ROUNDS):
-        R_HT = resection(problem, t, n, d)
-        t_HT, t = positions_for(problem, R_HT, n, d)
+        R_HT = resection(problem, t, rays)
+        t_HT, t = positions_for(problem, R_HT, rays)
     return R_HT, t_HT, t
 
 
@@ -101,7 +125,7 @@ def _cube_rotations() -> Array:
     return np.concatenate([cube @ turn for turn in turns])
 
 
-def other_starts(problem: Problem, n: Array, d: Array) -> Iterator[tuple[Array, Array, Array]]:
+def other_starts(problem: Problem, rays: Rays) -> Iterator[tuple[Array, Array, Array]]:
     """Starts from 72 rotations spread over SO(3), each with its best t_HT and t."""
     for R_HT in _cube_rotations():
-        yield (R_HT, *positions_for(problem, R_HT, n, d))
+        yield (R_HT, *positions_for(problem, R_HT, rays))

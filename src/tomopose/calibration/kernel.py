@@ -80,6 +80,25 @@ def _scanner_vectors(s_0: Array, cols: Any, col_run: Any, factor: Array, delta: 
 
 
 @njit(cache=True)
+def centres(
+    R_k: Array, t_k: Array, alpha: Array, run: Any, ball: Any, s_0: Array, cols: Any, col_run: Any, factor: Array,
+    R_HT: Array, t_HT: Array, t: Array, delta: Array,
+) -> Array:
+    """(n, 2) px: the calculated centres, without derivatives; NaN where a ball is behind the source."""
+    n = R_k.shape[0]
+    out = np.full((n, 2), np.nan)
+    x_H, y_T, G_H, G_T = np.empty(3), np.empty(3), np.empty((2, 3)), np.empty((2, 3))
+    J_s, R, M = np.empty((2, 13)), np.empty((3, 3)), np.empty((3, 3))
+    s = s_0.copy()
+    _scanner_vectors(s_0, cols, col_run, factor, delta, s)
+    for k in range(n):
+        project_pose(
+            s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[ball[k]], alpha[k], False, out[k], x_H, G_H, G_T, y_T, J_s, R, M
+        )
+    return out
+
+
+@njit(cache=True)
 def normal_equations(
     x_meas: Array, W: Array, weight: Array, R_k: Array, t_k: Array, alpha: Array, run: Any, ball: Any, s: Array,
     cols: Any, col_run: Any, factor: Array, information: Array, R_HT: Array, t_HT: Array, t: Array, delta: Array,

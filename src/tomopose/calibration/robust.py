@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.fit import Fit, blocks, jacobian, minimise
+from tomopose.calibration.fit import Fit, blocks, jacobian, minimise, residuals, whitened2
 from tomopose.calibration.parameters import FreeParameters
 from tomopose.calibration.problem import Problem
 from tomopose.calibration.uncertainty import inverse_information
@@ -46,6 +46,19 @@ def limit(n: int) -> float:
     return -2.0 * math.log(FALSE_ALARM / n)
 
 
+def limit_beside(found: Array, n: int) -> float:
+    """The limit for n rows once outliers of squared distances `found` are among them.
+
+    Where many rows are wrong by little, a row a little nearer is more likely one of them than a clean row far out: a
+    share p of the rows has the spread s = mean(found) / 2 instead of 1, and the limit is where both are equally likely,
+    p exp(-d^2 / 2s) / s = (1 - p) exp(-d^2 / 2).  It is never above `limit`: gross errors do not excuse small ones.
+    """
+    if not len(found):
+        return limit(n)
+    p, s = min(len(found) / n, LARGEST_SHARE), float(np.mean(found)) / 2.0
+    return min(limit(n), 2.0 * s / (s - 1.0) * math.log(s * (1.0 - p) / p))
+
+
 def studentised(problem: Problem, free: FreeParameters, fit: Fit, keep: Any) -> Array:
     """(n,) squared residuals in their own predicted standard deviations.  Rows not kept count as predictions."""
     b = blocks(problem, free, fit)
@@ -73,8 +86,7 @@ def robust_fit(problem: Problem, free: FreeParameters, start: Fit) -> RobustFit:
         return RobustFit(fit=start, keep=all_rows, distance2=d2, scale=scale, misfit=False)
     fit, weight = start, all_rows.astype(float)
     for _ in range(REWEIGHTINGS):
-        r = problem.x_D - blocks(problem, free, fit).x_D
-        d2 = ((problem.W @ r[:, :, None])[..., 0] ** 2).sum(axis=1)
+        d2 = whitened2(problem, residuals(problem, free, fit))
         # Geman-McClure, whose influence falls to zero: a gross error does not pull at all
         new = (1.0 + d2 / (9.0 * max(1.0, _scale(d2)))) ** -2
         fit = minimise(problem, free, fit, weight=new, iterations=4)
@@ -83,13 +95,16 @@ def robust_fit(problem: Problem, free: FreeParameters, start: Fit) -> RobustFit:
         if settled:
             break
     keep = d2 <= limit(n) * max(1.0, _scale(d2))
-    for _ in range(RECLASSIFICATIONS):
+    for turn in range(2 * RECLASSIFICATIONS):
         if keep.mean() < 1.0 - LARGEST_SHARE or 2 * keep.sum() <= fit.N.shape[0] + 4:
             break
         fit = minimise(problem, free, fit, weight=keep.astype(float))
         d2 = studentised(problem, free, fit, keep)
         scale = _scale(d2[keep])
-        new_keep = d2 <= limit(n) * max(1.0, scale)
+        unit = max(1.0, scale)
+        new_keep = d2 <= limit_beside(d2[d2 > limit(n) * unit] / unit, n) * unit
+        # a row at the border, or two that hide each other, may come and go for ever: later nothing comes back
+        new_keep &= keep | (turn < RECLASSIFICATIONS)
         if (new_keep == keep).all():
             return RobustFit(fit=fit, keep=keep, distance2=d2, scale=scale, misfit=False)
         keep = new_keep
