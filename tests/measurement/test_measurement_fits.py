@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.rotations import exp_rotation
 from tomopose.measurement import measurands as m
-from tomopose.measurement.correlation import effective_number
+from tomopose.measurement.correlation import independence
 from tomopose.measurement.features import narrowest_shell, patch_means
 from tomopose.measurement.fits import fit_circle, fit_cone, fit_cylinder, fit_line, fit_plane, fit_sphere
 from tomopose.measurement.probing import cylinder_pattern, plane_pattern, sphere_pattern
@@ -87,17 +87,69 @@ def test_known_uncertainties_weigh():
     assert abs(fit_plane(points, sigma=sigma).point[2]) < 1e-6
 
 
-def test_common_errors_of_neighbours_lower_the_effective_number():
-    rng = np.random.default_rng(5)
-    points, _ = plane_pattern([0, 0, 0], [0, 0, 1], [5, 0, 0], [0, 5, 0], 2500)
+def correlated_height(length, runs, rng, reach=2.0):
+    """Ratio of the scatter of a plane's height to its stated u, mean effective number and the true one, for errors that
+    are correlated over `length` mm."""
+    points, _ = plane_pattern([0, 0, 0], [0, 0, 1], [4, 0, 0], [0, 4, 0], 900)
     d = np.linalg.norm(points[:, None] - points[None], axis=2)
-    C = np.exp(-((d / 0.4) ** 2)) + 1e-9 * np.eye(len(points))
-    truth = len(points) ** 2 / C.sum()
+    C = np.exp(-((d / length) ** 2)) + 1e-9 * np.eye(len(points))
     L = np.linalg.cholesky(C)
-    found = [effective_number(points, L @ rng.standard_normal(len(points)), 2.0) for _ in range(5)]
-    assert np.mean(found) == pytest.approx(truth, rel=0.2)
-    assert effective_number(points, rng.standard_normal(len(points)), 2.0) > 0.8 * len(points)
-    assert effective_number(points, rng.standard_normal(len(points)), 0.0) == len(points)
+    fits = []
+    for _ in range(runs):
+        moved = points.copy()
+        moved[:, 2] += 0.01 * L @ rng.standard_normal(len(points))
+        fits.append(fit_plane(moved, correlation_range=reach))
+    height, u = np.array([f.point[2] for f in fits]), np.array([np.sqrt(f.covariance[2, 2]) for f in fits])
+    return (np.std(height) / np.sqrt(np.mean(u**2)), np.mean([f.n_effective for f in fits]),
+            len(points) ** 2 / C.sum(), fits)
+
+
+@pytest.mark.parametrize("length", [0.05, 0.4, 0.7])
+def test_common_errors_of_neighbours_widen_the_uncertainty_by_what_they_cost(length):
+    runs = 60
+    ratio, found, truth, fits = correlated_height(length, runs, np.random.default_rng(5))
+    assert ratio == pytest.approx(1.0, abs=3 / np.sqrt(2 * runs))
+    assert found == pytest.approx(truth, rel=0.25)
+    stated = np.array([f.covariance[2, 2] for f in fits])
+    # Degrees of freedom say how well the variance itself is known: its relative variance is 2 / dof.
+    assert np.std(stated) / np.mean(stated) < 1.5 * np.sqrt(2 / np.median([f.dof for f in fits]))
+
+
+def test_differing_neighbours_narrow_it():
+    """Interpolation makes neighbours differ: errors that are differences add up to less."""
+    points, _ = plane_pattern([0, 0, 0], [0, 0, 1], [4, 0, 0], [0, 4, 0], 1600)
+    rng = np.random.default_rng(6)
+    heights, stated = [], []
+    for _ in range(60):
+        e = rng.standard_normal((42, 42))
+        e = e[1:-1, 1:-1] + 0.5 * (e[2:, 1:-1] + e[1:-1, 2:]) - 0.3 * (e[:-2, 1:-1] + e[1:-1, :-2])
+        moved = points.copy()
+        moved[:, 2] += 0.01 * e.ravel()
+        f = fit_plane(moved, correlation_range=1.2)
+        heights.append(f.point[2])
+        stated.append(f.covariance[2, 2])
+    assert np.std(heights) / np.sqrt(np.mean(stated)) == pytest.approx(1.0, abs=3 / np.sqrt(2 * 60))
+
+
+def test_independent_points_stay_independent():
+    rng = np.random.default_rng(7)
+    points, _ = plane_pattern([0, 0, 0], [0, 0, 1], [5, 0, 0], [0, 5, 0], 2500)
+    J = np.column_stack([-np.ones(len(points)), points[:, :2]])[None]
+    noise = rng.standard_normal((1, len(points)))
+    assert independence(points, noise, J, 1.2).n_effective > 0.75 * len(points)
+    assert independence(points, noise, J, 0.0).n_effective == len(points)
+    assert independence(points, noise, J, 0.0).dof == len(points) - 3
+    with pytest.raises(InputError, match="correlation_range"):
+        independence(points, noise, J, -1.0)
+
+
+def test_both_components_of_a_line_count():
+    """A line's residuals are unsigned distances; its correlation is that of the two components across it."""
+    rng = np.random.default_rng(8)
+    t = np.linspace(0, 10, 400)
+    found = [fit_line(np.column_stack([0.01 * rng.standard_normal((400, 2)), t]), correlation_range=0.3)
+             for _ in range(30)]
+    assert np.mean([f.n_effective for f in found]) == pytest.approx(400, rel=0.25)
 
 
 @settings(max_examples=25, deadline=None)

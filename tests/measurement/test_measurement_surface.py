@@ -168,7 +168,7 @@ def test_stated_intervals_hold_the_truth():
     grid = VoxelGrid(shape=(20, 26, 30), spacing=np.full(3, 0.1))
     z = grid.origin[2] + 0.1 * np.arange(20)
     points, normals = plane_pattern([0, 0, 0], [0, 0, 1], [0.6, 0, 0], [0, 0.45, 0], 250)
-    held, ratio = 0, []
+    held, errors, variances = 0, [], []
     for run in range(120):
         rng = np.random.default_rng(np.random.SeedSequence([17, run]))
         height = rng.uniform(-0.05, 0.05)
@@ -176,10 +176,12 @@ def test_stated_intervals_hold_the_truth():
         found = probe(as_volume(values, grid), points, normals, settings=EdgeSettings(sigma=0.1), contrast=1.0)
         plane = fit_plane(found.points[found.good], outliers=3.0, correlation_range=0.6)
         error, u = plane.point[2] - height, plane.u[2]
-        held += abs(error) <= t.ppf(0.975, plane.n_effective - 3) * u
-        ratio.append(error / u)
-    assert held >= 102
-    assert 0.75 < np.sqrt(np.mean(np.square(ratio))) < 1.2
+        held += abs(error) <= t.ppf(0.975, plane.dof) * u
+        errors.append(error)
+        variances.append(u**2)
+    # 95 % of 120 within three standard deviations of a binomial; the rms error within the same.
+    assert 107 <= held <= 120
+    assert np.sqrt(np.mean(np.square(errors)) / np.mean(variances)) == pytest.approx(1.0, abs=3 / np.sqrt(240))
 
 
 class TestBadInput:

@@ -1,15 +1,22 @@
 """How many independent points a fit really has: neighbours on a CT surface share voxels and so share their errors.
 
-With a correlation rho(h) of the residuals at distance h, the mean of n points has the variance
+With the covariance C of the errors and derivatives J that change little from point to point, the parameters of a fit
+have the covariance s^2 L (J' J)^-1, where L is the number of points that act as one, L = n / n_eff:
 
-    s^2 / n * (1 + mean over points of the sum of rho over their neighbours) = s^2 / n_eff.
+    s^2 L = 1/n sum over i, j of C_ij.
 
-A fit of p parameters takes about p / n_eff away from the correlation of its residuals at every distance; that is put
-back.
+The sum is taken over the residuals r = (1 - H) e, H = J (J' J)^-1 J', of pairs closer than a window.  The fit takes
+L H out of C, so that with K, the sum of H over the same pairs,
+
+    E sum r_i r_j = s^2 L (n - K),        E sum r_i^2 = s^2 (n - L p).
+
+Interpolation between voxels makes neighbours further off differ (rho < 0), which belongs to the sum too: the window is
+never shorter than a share of the range, and grows until it holds several times the points that act as one.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,41 +24,81 @@ import numpy as np
 from tomopose.errors import InputError
 from tomopose.units import Array
 
-SAMPLES, BINS, ROUNDS = 4000, 12, 5
+SAMPLES, BINS = 8000, 24
+SHORTEST = 0.4
+"""Share of the range below which the window does not fall: 2.5 voxels where the range is 6."""
+HOLDS = 4.0
+"""The window holds this many times the points that act as one."""
+LEFT = 0.3
+"""Share of the points' freedom, (n - K) / n, that a window must leave to be used."""
 
 
-def effective_number(points: Array, residuals: Array, correlation_range: float, parameters: int = 0) -> float:
-    """n_eff of points (n, 3), mm, with residuals (n,) of a fit, looking at pairs up to `correlation_range`, mm.
+@dataclass(frozen=True, kw_only=True)
+class Independence:
+    """variance: s^2 L, that of one point times the points that act as one, in the residuals' unit squared;
+    n_effective: n / L; dof: degrees of freedom of the variance."""
 
-    rho is estimated in bins of distance and taken as zero from its first bin that is not positive on.  0 for the range
-    gives n.  The result lies between 1 and n.
+    variance: float
+    n_effective: float
+    dof: float
+
+
+def independence(points: Array, residuals: Array, derivatives: Array, correlation_range: float) -> Independence:
+    """Independence of the errors of points (n, 3), mm, with residuals (k, n) of a fit with derivatives (k, n, p).
+
+    k: residuals a point has (two for a line in space).  correlation_range: mm, up to which neighbours may act as one;
+    0 takes all points as independent.
+    """
+    if not (np.isfinite(correlation_range) and correlation_range >= 0):
+        raise InputError(f"correlation_range is {correlation_range} mm; 0 or a positive length is needed")
+    k, n = residuals.shape
+    p = derivatives.shape[2]
+    total = float(np.sum(residuals**2))
+    if k * n <= p:
+        return Independence(variance=np.inf, n_effective=float(n), dof=0.0)
+    alone = Independence(variance=total / (k * n - p), n_effective=float(n), dof=float(k * n - p))
+    if correlation_range == 0 or total == 0:
+        return alone
+    count, product, taken = _sums(points, residuals, derivatives, correlation_range)
+    # Cumulative over the bins of distance: neighbours a point has, sum of r_i r_j, sum of H.
+    usable = np.flatnonzero(n * k - taken > LEFT * n * k)
+    if not usable.size:
+        return alone
+    with np.errstate(divide="ignore", invalid="ignore"):
+        acting = product * k * n / (total * (k * n - taken) + product * p)
+    wide = np.arange(len(count)) + 1 >= SHORTEST * len(count)
+    enough = usable[wide[usable] & (count[usable] >= HOLDS * acting[usable])]
+    window = int(enough[0]) if enough.size else int(usable[-1])
+    # A point never stands for less than itself.
+    L = float(np.clip(acting[window], 1.0, n)) if np.isfinite(acting[window]) else 1.0
+    freedom = k * n - L * p
+    if freedom <= 0:
+        return Independence(variance=np.inf, n_effective=n / L, dof=0.0)
+    # Each window full of points tells L once.
+    dof = max(min(k * n / float(count[window]), k * n - p), 1.0)
+    return Independence(variance=L * total / freedom, n_effective=n / L, dof=dof)
+
+
+def _sums(points: Array, residuals: Array, derivatives: Array, reach: float) -> tuple[Array, Array, Array]:
+    """Cumulative over BINS of distance up to reach: points within it (mean), sums of r_i r_j and of H_ij over pairs.
+
+    Large sets are summed over every few points' neighbours, and scaled.
     """
     from scipy.spatial import cKDTree
 
-    n = len(points)
-    if not (np.isfinite(correlation_range) and correlation_range >= 0):
-        raise InputError(f"correlation_range is {correlation_range} mm; 0 or a positive length is needed")
-    variance = float(np.mean(residuals**2))
-    if correlation_range == 0 or variance == 0:
-        return float(n)
-    chosen = np.arange(0, n, max(n // SAMPLES, 1))
-    tree = cKDTree(points)
-    pairs: Any = tree.query_ball_point(points[chosen], correlation_range)
-    first = np.repeat(chosen, [len(p) for p in pairs])
-    second = np.concatenate([np.asarray(p, dtype=np.intp) for p in pairs])
-    first, second = first[first != second], second[first != second]
-    if first.size == 0:
-        return float(n)
-    h = np.linalg.norm(points[first] - points[second], axis=1)
-    bin_of = np.minimum((h / correlation_range * BINS).astype(np.intp), BINS - 1)
-    count = np.bincount(bin_of, minlength=BINS)
-    product = np.bincount(bin_of, weights=residuals[first] * residuals[second], minlength=BINS)
-    rho = np.divide(product, count * variance, out=np.zeros(BINS), where=count > 0)
-    stops = np.flatnonzero((rho <= 0) & (count > 0))
-    end = stops[0] if stops.size else BINS
-    n_effective = float(n)
-    for _ in range(ROUNDS):
-        lost = parameters / n_effective
-        inflation = 1.0 + float(np.sum((rho[:end] + lost) / (1.0 + lost) * count[:end])) / len(chosen)
-        n_effective = float(np.clip(n / inflation, 1.0, n))
-    return n_effective
+    k, n, p = derivatives.shape
+    Q = np.linalg.qr(derivatives.reshape(k * n, p))[0].reshape(k, n, p)
+    chosen = np.arange(0, n, -(-n // SAMPLES))
+    pairs: Any = cKDTree(points[chosen]).sparse_distance_matrix(cKDTree(points), reach, output_type="ndarray")
+    first, second = chosen[pairs["i"]], pairs["j"]
+    other = first != second
+    first, second, h = first[other], second[other], pairs["v"][other]
+    bin_of = np.minimum((h / reach * BINS).astype(np.intp), BINS - 1)
+    scale = n / len(chosen)
+    count = 1.0 + np.cumsum(np.bincount(bin_of, minlength=BINS)) / len(chosen)
+    product, taken = np.full(BINS, float(np.sum(residuals**2))), np.full(BINS, float(p))
+    for r, q in zip(residuals, Q, strict=True):
+        product += scale * np.cumsum(np.bincount(bin_of, weights=r[first] * r[second], minlength=BINS))
+        shared = np.einsum("ij,ij->i", q[first], q[second])
+        taken += scale * np.cumsum(np.bincount(bin_of, weights=shared, minlength=BINS))
+    return count, product, taken

@@ -43,6 +43,7 @@ class Feature:
     points:       (n, 3) mm, all points given;  used: (n,) bool, those that the fit kept.
     residuals:    (n,) signed orthogonal distances of all points, mm; positive outside (along the normal of a plane).
     n_effective:  number of independent points that carry the same information as the used ones.
+    dof:          degrees of freedom of the covariance; fewer than those points, since their correlation is estimated.
     outlier_rule: in words.
     """
 
@@ -53,6 +54,7 @@ class Feature:
     used: np.ndarray
     residuals: Array
     n_effective: float
+    dof: float
     outlier_rule: str = "none"
 
     def __post_init__(self) -> None:
@@ -134,7 +136,7 @@ class Feature:
             "kind": self.kind,
             "parameters": {n: v for n, v in zip(PARAMETERS, self.vector.tolist(), strict=True) if math.isfinite(v)},
             "u": {n: u for n, u, v in zip(PARAMETERS, self.u.tolist(), self.vector, strict=True) if math.isfinite(v)},
-            "n_points": len(self.points), "n_used": self.n_used, "n_effective": self.n_effective,
+            "n_points": len(self.points), "n_used": self.n_used, "n_effective": self.n_effective, "dof": self.dof,
             "rms_mm": self.rms, "form_mm": self.form, "form_95_mm": self.form_95,
             "outlier_rule": self.outlier_rule,
         }

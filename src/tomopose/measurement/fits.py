@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from tomopose.errors import InputError, ShapeError
-from tomopose.measurement.correlation import effective_number
+from tomopose.measurement.correlation import Independence, independence
 from tomopose.measurement.features import Feature
 from tomopose.measurement.shapes import (
     DEGENERATE,
@@ -50,7 +50,8 @@ MAX_OUTLIER_ROUNDS = 20
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Block:
     """One linear least-squares problem at the solution: distances d (m,) with sigma (m,), their derivatives J (m, p),
-    and T (8, p), the derivatives of the feature's vector.  The blocks of a feature are independent of one another."""
+    and T (8, p), the derivatives of the feature's vector.  The blocks of a feature are independent of one another.
+    m is the number of points or a multiple of it: one component of all points after the other."""
 
     d: Array
     sigma: Array
@@ -164,26 +165,21 @@ def _fit(
         if np.array_equal(keep, used):
             break
         used = keep
-    n_effective = effective_number(x[used], (d / s)[used], correlation_range, sum(b.J.shape[1] for b in blocks))
-    share = n_effective / int(used.sum())
+    shares = [_covariance(b, x[used], correlation_range) for b in blocks]
     return Feature(
-        kind=kind, vector=vector, covariance=sum((_covariance(b, share) for b in blocks), np.zeros((8, 8))),
-        points=x, used=used, residuals=d, n_effective=n_effective,
+        kind=kind, vector=vector, covariance=sum((c for c, _ in shares), np.zeros((8, 8))), points=x, used=used,
+        residuals=d, n_effective=min(i.n_effective for _, i in shares), dof=min(i.dof for _, i in shares),
         outlier_rule="none" if outliers is None else f"{outliers:g} rms, repeated until none is left",
     )
 
 
-def _covariance(block: Block, share: float) -> Array:
-    """(8, 8) = T s^2 (J' W J)^-1 T' / share, s^2 from the residuals; infinite where no degree of freedom is left.
-
-    share: n_effective / n.
-    """
-    m, p = block.J.shape
+def _covariance(block: Block, points: Array, correlation_range: float) -> tuple[Array, Independence]:
+    """(8, 8) = T s^2 L (J' W J)^-1 T', s^2 L from the residuals; infinite where no degree of freedom is left."""
+    p, n = block.J.shape[1], len(points)
     J = block.J / block.sigma[:, None]
-    freedom = m * share - p
-    spread = float(np.sum((block.d / block.sigma) ** 2)) / freedom if freedom > 0 else np.inf
+    found = independence(points, (block.d / block.sigma).reshape(-1, n), J.reshape(-1, n, p), correlation_range)
     covariance = block.T @ np.linalg.pinv(J.T @ J, hermitian=True) @ block.T.T
-    return np.multiply(covariance, spread, out=np.zeros((8, 8)), where=covariance != 0)
+    return np.multiply(covariance, found.variance, out=np.zeros((8, 8)), where=covariance != 0), found
 
 
 def feature_distances(kind: str, vector: Array, points: Array) -> Array:

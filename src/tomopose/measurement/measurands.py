@@ -184,7 +184,7 @@ def _propagated(
         used = g != 0
         shares.append(float(g[used] @ f.covariance[np.ix_(used, used)] @ g[used]))
     variance = max(sum(shares), 0.0)
-    freedom = [max(f.n_effective - np.count_nonzero(np.diag(f.covariance)), 1.0) for f in features]
+    freedom = [max(f.dof, 1.0) for f in features]
     weight = sum(s**2 / d for s, d in zip(shares, freedom, strict=True))
     dof = variance**2 / weight if weight > 0 else min(freedom)
     return Measured(value=value, u=float(np.sqrt(variance)), dof=float(dof), unit=unit, direction=direction,

@@ -1,6 +1,6 @@
 """How often the stated 95 % interval of a length holds the truth: seeded volumes in closed form with noise.
 
-    python benchmarks/measurement/coverage.py [--runs 600] [--correlation 0.0]
+    python benchmarks/measurement/intervals.py [--runs 600] [--correlation 0.0]
 
 Three lengths in each volume: centre to centre of two balls (unidirectional), plane to plane of a block (bidirectional),
 and the plane to plane length of one volume with voxel noise that is correlated over --correlation voxels.
