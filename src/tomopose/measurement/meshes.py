@@ -9,12 +9,10 @@ import struct
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from tomopose.errors import EngineMissingError, FileError, InputError, ShapeError
-from tomopose.measurement.contour import INSTALL_LINE
+from tomopose.errors import FileError, InputError, ShapeError
 from tomopose.units import Array, float_array
 
 SHARP = np.radians(30.0)
@@ -47,31 +45,36 @@ class Mesh:
         return np.cross(b - a, c - a)
 
     @cached_property
+    def _unit_face_normals(self) -> Array:
+        n = self.face_normals
+        return n / np.maximum(np.linalg.norm(n, axis=1), 1e-300)[:, None]
+
+    @cached_property
     def normals(self) -> Array:
         """(n, 3) unit, weighted by the triangles' angles at the vertex."""
-        n = self.face_normals / np.maximum(np.linalg.norm(self.face_normals, axis=1), 1e-300)[:, None]
-        out = np.zeros_like(self.points)
+        n, out = self._unit_face_normals, np.zeros_like(self.points)
         for k in range(3):
             p, q, r = (self.points[self.faces[:, (k + j) % 3]] for j in range(3))
             u, v = q - p, r - p
             angle = np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), np.einsum("ij,ij->i", u, v))
-            np.add.at(out, self.faces[:, k], angle[:, None] * n)
+            for a in range(3):
+                out[:, a] += np.bincount(self.faces[:, k], weights=angle * n[:, a], minlength=len(out))
         return out / np.maximum(np.linalg.norm(out, axis=1), 1e-300)[:, None]
 
     @cached_property
-    def _half_edges(self) -> tuple[np.ndarray, np.ndarray]:
-        """Undirected edges sorted (3 m, 2) and the triangle of each."""
-        edges = np.concatenate([self.faces[:, [k, (k + 1) % 3]] for k in range(3)])
-        face = np.tile(np.arange(len(self.faces)), 3)
-        edges = np.sort(edges, axis=1)
-        order = np.lexsort((edges[:, 1], edges[:, 0]))
-        return edges[order], face[order]
+    def _edges(self) -> tuple[np.ndarray, np.ndarray]:
+        """Each triangle's three edges ab, bc, ca as one number (3 m,), the same for both triangles that share it, and
+        the order (3 m,) that sorts them; edge k of triangle f is entry 3 f + k."""
+        ends = np.sort(np.stack([self.faces, np.roll(self.faces, -1, axis=1)], axis=-1), axis=-1).reshape(-1, 2)
+        key = ends[:, 0].astype(np.int64) * len(self.points) + ends[:, 1]
+        return key, np.argsort(key, kind="stable")
 
     @property
     def open_edges(self) -> int:
         """Edges that do not join exactly two triangles."""
-        _, count = np.unique(self._half_edges[0], axis=0, return_counts=True)
-        return int(np.count_nonzero(count != 2))
+        key, order = self._edges
+        begins = np.flatnonzero(np.diff(key[order], prepend=-1))
+        return int(np.count_nonzero(np.diff(begins, append=len(key)) != 2))
 
     @cached_property
     def elements(self) -> np.ndarray:
@@ -88,21 +91,38 @@ class Mesh:
     @cached_property
     def on_edge(self) -> np.ndarray:
         """(n,) True for vertices on a sharp edge."""
-        edges, _ = self._half_edges
-        first = np.flatnonzero((edges[:-1] == edges[1:]).all(axis=1))
-        _, sharp = self._neighbours()
+        key = self._edges[0][self._shared[0][self._neighbours()[1]]]
         mask = np.zeros(len(self.points), dtype=bool)
-        mask[edges[first[sharp]].ravel()] = True
+        mask[key // len(self.points)] = True
+        mask[key % len(self.points)] = True
         return mask
+
+    @property
+    def _shared(self) -> tuple[np.ndarray, np.ndarray]:
+        """Entries of `_edges` of both sides of each edge that two triangles share."""
+        key, order = self._edges
+        first = np.flatnonzero(key[order][:-1] == key[order][1:])
+        return order[first], order[first + 1]
 
     def _neighbours(self) -> tuple[np.ndarray, np.ndarray]:
         """Pairs of triangles (k, 2) that share an edge, and whether the edge is sharp."""
-        edges, face = self._half_edges
-        first = np.flatnonzero((edges[:-1] == edges[1:]).all(axis=1))
-        pair = np.column_stack([face[first], face[first + 1]])
-        n = self.face_normals / np.maximum(np.linalg.norm(self.face_normals, axis=1), 1e-300)[:, None]
-        cosine = np.einsum("ij,ij->i", n[pair[:, 0]], n[pair[:, 1]])
-        return pair, cosine < np.cos(SHARP)
+        one, other = self._shared
+        pair = np.column_stack([one // 3, other // 3])
+        n = self._unit_face_normals
+        return pair, np.einsum("ij,ij->i", n[pair[:, 0]], n[pair[:, 1]]) < np.cos(SHARP)
+
+    @cached_property
+    def pseudo_normals(self) -> Array:
+        """(m, 7, 3) of each triangle: its own unit normal, those of its edges ab, bc, ca (the sum of both neighbours'),
+        and of its corners.  Lengths do not matter."""
+        n, (one, other) = self._unit_face_normals, self._shared
+        out = np.empty((len(self.faces), 7, 3))
+        out[:, 0], out[:, 4:] = n, self.normals[self.faces]
+        both = np.repeat(n, 3, axis=0)
+        both[one] += n[other // 3]
+        both[other] += n[one // 3]
+        out[:, 1:4] = both.reshape(-1, 3, 3)
+        return out
 
     @property
     def size(self) -> float:
@@ -205,30 +225,18 @@ def _read_ply(content: bytes) -> Mesh:
 def signed_distances(points: Array, mesh: Mesh) -> Array:
     """(n,) signed distances, mm, of points (n, 3) to the nearest place of a closed mesh; positive outside.
 
-    Exact point to triangle distances with pseudo-normals for the sign (VTK).  EngineMissingError without VTK.
+    Exact.  ShapeError for points of another shape, InputError for a mesh that is not closed or faces inwards.
     """
-    try:
-        from vtkmodules.util import numpy_support as _numpy_support
-        from vtkmodules.vtkCommonCore import vtkDoubleArray, vtkPoints
-        from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
-        from vtkmodules.vtkFiltersCore import vtkImplicitPolyDataDistance
-    except ImportError as error:
-        raise EngineMissingError("VTK is needed for distances to a mesh", install_line=INSTALL_LINE) from error
-    numpy_support: Any = _numpy_support
+    from tomopose.measurement.mesh_distance import build_tree, tree_distances
+
     x = np.ascontiguousarray(points, dtype=np.float64)
     if x.ndim != 2 or x.shape[1] != 3:
         raise ShapeError(f"points are (n, 3); got {x.shape}")
+    if not np.isfinite(x).all():
+        raise InputError(f"{int((~np.isfinite(x)).any(axis=1).sum())} of {len(x)} points are not finite; drop them")
     mesh.require_closed()
-    corners = vtkPoints()
-    corners.SetDataTypeToDouble()
-    corners.SetData(numpy_support.numpy_to_vtk(np.array(mesh.points), deep=True))
-    cells = vtkCellArray()
-    cells.SetData(3, numpy_support.numpy_to_vtkIdTypeArray(np.array(mesh.faces, dtype=np.int64).ravel(), deep=True))
-    data = vtkPolyData()
-    data.SetPoints(corners)
-    data.SetPolys(cells)
-    function = vtkImplicitPolyDataDistance()
-    function.SetInput(data)
-    out = vtkDoubleArray()
-    function.FunctionValue(numpy_support.numpy_to_vtk(x, deep=False), out)
-    return numpy_support.vtk_to_numpy(out).astype(np.float64)
+    corners = mesh.points[mesh.faces]
+    order, box, span, second = build_tree(corners.min(axis=1), corners.max(axis=1), corners.mean(axis=1))
+    return np.asarray(
+        tree_distances(x, corners[order].reshape(-1, 9), order, box, span, second, mesh.pseudo_normals[order])
+    )
