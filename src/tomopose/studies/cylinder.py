@@ -6,6 +6,7 @@ between the volumes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -54,20 +55,29 @@ NOTES = (
 )
 
 
-def cylinder_integrals(P: Array, scanner: Scanner) -> Array:
-    """Line integrals (n_v, n_u) of the upright cylinder in the view with matrix P (3, 4), pixel centres."""
+def cylinder_integrals(
+    P: Array, scanner: Scanner, *, radius: float = RADIUS,
+    ends: Sequence[tuple[float, float]] = ((-HALF_HEIGHT, HALF_HEIGHT),),
+) -> Array:
+    """Line integrals (n_v, n_u) of upright cylinders about z in the view with matrix P (3, 4), pixel centres.
+
+    ends: heights, mm, of the two end faces of each cylinder; they do not overlap.
+    """
     inverse = np.linalg.inv(P[:, :3])
     s = -inverse @ P[:, 3]
     u, v = np.meshgrid(np.arange(scanner.n_u), np.arange(scanner.n_v))
     d = np.stack([u, v, np.ones_like(u)], axis=-1) @ inverse.T
     d /= np.linalg.norm(d, axis=-1, keepdims=True)
     a, b = d[..., 0] ** 2 + d[..., 1] ** 2, d[..., 0] * s[0] + d[..., 1] * s[1]
-    under = b**2 - a * (s[0] ** 2 + s[1] ** 2 - RADIUS**2)
+    under = b**2 - a * (s[0] ** 2 + s[1] ** 2 - radius**2)
     root = np.sqrt(np.maximum(under, 0.0))
-    with np.errstate(divide="ignore"):
-        ends = np.sort((np.array([-HALF_HEIGHT, HALF_HEIGHT]) - s[2]) / d[..., 2, None], axis=-1)
-    low, high = np.maximum((-b - root) / a, ends[..., 0]), np.minimum((-b + root) / a, ends[..., 1])
-    return np.where(under > 0, ATTENUATION * np.maximum(high - low, 0.0), 0.0)
+    enter, leave = (-b - root) / a, (-b + root) / a
+    length = np.zeros_like(a)
+    for faces in ends:
+        with np.errstate(divide="ignore"):
+            low, high = np.sort((np.array(faces)[:, None, None] - s[2]) / d[..., 2], axis=0)
+        length += np.maximum(np.minimum(leave, high) - np.maximum(enter, low), 0.0)
+    return np.where(under > 0, ATTENUATION * length, 0.0)
 
 
 def surface_deviation(volume: Volume) -> Array:
