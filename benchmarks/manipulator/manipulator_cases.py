@@ -61,13 +61,18 @@ def tilted_scan(T_HT: RigidTransform, *, n: int = 180, wide: bool = False) -> Po
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """What a run needs and what is true: machine as it is believed, poses, observations, scan and its true matrices."""
+    """What a run needs and what is true: machine as it is believed, poses, observations, scan and its true matrices.
+
+    P_true: of the cool machine that does not scatter; P_executed: of the scan as it was run, with scatter, and
+    warming up as in the calibration.
+    """
 
     machine: Any
     poses: PoseSequence
     observations: BallObservations
     scan: PoseSequence
     P_true: Any
+    P_executed: Any
     points: Any
     scanner: Scanner
 
@@ -77,7 +82,7 @@ def experiment(
     rng: np.random.Generator, believed: Any = None, disturbance: Disturbance | None = None, scanner: Scanner = SCANNER,
     centre: Any = None,
 ) -> Experiment:
-    """Image the balls on the real machine; the scan is executed by the same machine, cool and without scatter.
+    """Image the balls on the real machine, which then executes the scan.
 
     centre: middle of the object in M, mm, where it is not what stands at the W origin at home (a robot's flange).
     """
@@ -94,11 +99,15 @@ def experiment(
     still = replace(
         disturbance, growth_mm=(0.0, 0.0, 0.0), growth_rad=(0.0, 0.0, 0.0), scatter=Repeatability(t_mm=0.0, w_rad=0.0)
     )
-    scanned = real_motion(machine, scan, p, disturbance=still)
+    matrices = [
+        eq5_matrices(scanner, T_HT=T_HT, T_MH=real_motion(machine, scan, p, disturbance=d, rng=rng).T_MH,
+                     alpha=scan.alpha)
+        for d in (still, disturbance)
+    ]
     home = scanner.T_TW(0.0) @ T_HT
     return Experiment(
         machine=machine if believed is None else believed, poses=poses, observations=observations, scan=scan,
-        P_true=eq5_matrices(scanner, T_HT=T_HT, T_MH=scanned.T_MH, alpha=scan.alpha),
+        P_true=matrices[0], P_executed=matrices[1],
         points=object_points() if centre is None else home.apply(np.asarray(centre) + object_points()),
         scanner=scanner,
     )
@@ -160,12 +169,27 @@ def robot_experiment(robot: Any, seed: int, *, n: int = 200, balls: int = 1, tab
     return experiment(robot, p, poses, scan, T_HT=T_HT, balls=t, rng=rng, centre=(0.0, 0.0, 40.0))
 
 
-def trajectory_error(calibration: Calibration, e: Experiment) -> tuple[float, float, float]:
-    """(rms error px, rms of the stated uncertainty px, share of coordinates inside 95 %) of the scan's points."""
+@dataclass(frozen=True, kw_only=True)
+class ScanError:
+    """px, rms over views and points of the distance, the object's rigid pose removed: error of the matrices (that all
+    views share) and what is stated for it; error of the single views as executed and what is stated for them.
+    inside: share of the single views' coordinates that 95 % of the stated uncertainty covers."""
+
+    shared: float
+    u_shared: float
+    single: float
+    u_single: float
+    inside: float
+
+
+def scan_error(calibration: Calibration, e: Experiment) -> ScanError:
     P = projection_matrices(calibration, e.scan).P
-    d = without_object_pose(P, e.P_true, e.points)
-    sigma = trajectory_sigma(calibration, e.scan, e.points)
-    return rms_px(d), float(np.sqrt(np.mean(np.sum(sigma**2, axis=-1)))), float(np.mean(np.abs(d) < 1.96 * sigma))
+    d, d_single = (without_object_pose(P, true, e.points) for true in (e.P_true, e.P_executed))
+    u, u_single = (trajectory_sigma(calibration, e.scan, e.points, scatter=s) for s in (False, True))
+    return ScanError(
+        shared=rms_px(d), u_shared=rms_px(u), single=rms_px(d_single), u_single=rms_px(u_single),
+        inside=float(np.mean(np.abs(d_single) < 1.96 * u_single)),
+    )
 
 
 def run(e: Experiment, model: str) -> Calibration:

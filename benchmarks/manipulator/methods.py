@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
-from manipulator_cases import DETECTION_PX, SCANNER, UM_PER_PX, hexapod_experiment, trajectory_error
+from manipulator_cases import DETECTION_PX, SCANNER, UM_PER_PX, hexapod_experiment, scan_error
 from run import HEXAPOD, WORN
 
 from tomopose import BallObservations, Frame, PoseSequence, RigidTransform
@@ -44,7 +44,7 @@ def one_scan(seed: int) -> tuple[float, float, float]:
     poses = poses_of_views(SCANNER, list(views), BALLS, covariance=weight)
     P = np.array([SCANNER.P_S @ SCANNER.T_WS.matrix @ pose.T_MW.matrix for pose in poses])
     balls = rms_px(without_object_pose(P, e.P_true, e.points))
-    return trajectory_error(rigid, e)[0], trajectory_error(found, e)[0], balls
+    return scan_error(rigid, e).shared, scan_error(found, e).shared, balls
 
 
 def moving_scanner(seed: int) -> tuple[float, float]:

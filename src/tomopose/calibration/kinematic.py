@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from tomopose.calibration.kinematic_fit import ModelFit, fit_model
-from tomopose.calibration.kinematic_result import calibration_of, comparison
+from tomopose.calibration.kinematic_result import calibration_of, comparison, scatter_block
 from tomopose.calibration.kinematic_solve import KinematicProblem, State
 from tomopose.calibration.model_choice import EVIDENCE_GAIN, Judgement, better, judge
 from tomopose.calibration.multi_ball import require_balls_not_swapped
@@ -111,7 +111,8 @@ def calibrate_kinematic(
     judged = {name: judge(name, fit) for name, fit in fits.items()}
     chosen = _choose(model, judged)
     if chosen == "rigid" and model == "auto":
-        return replace(rigid, extra={**rigid.extra, **comparison(judged, fits, chosen)})
+        block = {**rigid.manipulator, "scatter": scatter_block(fits["rigid"])}
+        return replace(rigid, manipulator=block, extra={**rigid.extra, **comparison(judged, fits, chosen)})
     return calibration_of(rigid, fits, judged, chosen, model, data.pose_id, doubts)
 
 

@@ -13,6 +13,7 @@ from tomopose.calibration.residuals import whiteners
 from tomopose.calibration.robust import LARGEST_SHARE, MEDIAN_CHI2_2, RECLASSIFICATIONS, limit
 from tomopose.calibration.uncertainty import WIDENING_PROBABILITY
 from tomopose.errors import NotConvergedError
+from tomopose.manipulator.pose_map import PoseMap
 from tomopose.units import Array
 
 SCATTER_STEPS = 12
@@ -25,6 +26,10 @@ GROSS = 8.0
 the first fit; what belongs comes back."""
 SIZE_STEPS = 4
 SMALLEST_SIZE, LARGEST_SIZE = 1e-3, 30.0
+GROUP_STEPS = 10
+DETERMINED, LEAST_KNOWN_SHARE = 0.5, 0.5
+"""A group of a map's terms takes its size from the data where they determine as much of it; turns take one of their own
+where the data determine that share of them."""
 SIZE_GAIN = 3.0
 """Natural log units of evidence that another size of the errors must gain over the stated one to be believed."""
 
@@ -110,6 +115,8 @@ def with_size(estimate: MapEstimate) -> tuple[MapEstimate, float]:
     model = estimate.problem.model
     if model is None or not len(model.names):
         return estimate, 1.0
+    if isinstance(model, PoseMap):
+        return _with_group_sizes(estimate, model), 1.0
     m = len(model.names)
     size, now = 1.0, estimate
     for _ in range(SIZE_STEPS):
@@ -122,6 +129,28 @@ def with_size(estimate: MapEstimate) -> tuple[MapEstimate, float]:
         size *= change
         now = solve_map(replace(now.problem, model=model.resized(size)), now.state)
     return (now, size) if now.log_evidence > estimate.log_evidence + SIZE_GAIN else (estimate, 1.0)
+
+
+def _with_group_sizes(estimate: MapEstimate, model: PoseMap) -> MapEstimate:
+    """The estimate with every group of a map's terms sized by MacKay's rule.
+
+    Groups of turns that the data do not determine keep their proportion to the shifts of the same group.
+    """
+    half = model.group_count
+    for _ in range(GROUP_STEPS):
+        sigma, group = model.sigma, model.groups
+        m = len(sigma)
+        gamma = np.bincount(group, 1 - np.diag(estimate.covariance)[-m:] / sigma**2)
+        found = np.sqrt(np.bincount(group, (estimate.state.p / sigma) ** 2) / np.maximum(gamma, 1e-9))
+        change = np.where(gamma > DETERMINED, np.clip(found, 0.1, 10.0), 1.0)
+        turns_known = gamma[:half] > LEAST_KNOWN_SHARE * np.bincount(group)[:half]
+        change[:half] = np.where(turns_known, change[:half], change[half:])
+        if np.abs(np.log(change)).max() < 0.1:
+            break
+        factors = np.clip(np.asarray(model.factors) * change, SMALLEST_SIZE, None)
+        model = replace(model, factors=tuple(factors.tolist()))
+        estimate = solve_map(replace(estimate.problem, model=model), estimate.state)
+    return estimate
 
 
 def fit_model(

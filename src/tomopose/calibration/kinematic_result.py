@@ -21,8 +21,8 @@ from tomopose.manipulator.run_effects import WithRunEffects
 from tomopose.provenance import provenance
 
 RUN_EFFECTS_FOUND = (
-    "during the run the manipulator drifted or its drives lagged (drift and lag are among the parameters): the scan "
-    "may be off by as much again"
+    "during the run the manipulator drifted or its drives lagged (drift and lag are among the parameters): matrices "
+    "apply the lag in the order of the scan's table, and count the drift, which a scan may show again, as scatter"
 )
 NOTABLE_SCATTER, LARGE_SCATTER = 1.5, 9.0
 """Times the stated variance: a scatter that is no chance; one that means an error which no model here holds."""
@@ -63,6 +63,15 @@ def _parameters(fit: ModelFit) -> tuple[Parameter, ...]:
     return tuple(result)
 
 
+def scatter_block(fit: ModelFit) -> dict[str, float]:
+    """Standard deviations of the plate from pose to pose: its scatter, and the run's drift, which a scan may repeat."""
+    problem = fit.estimate.problem
+    variance = problem.scatter * problem.repeatability.variance
+    if isinstance(problem.model, WithRunEffects):
+        variance = variance + problem.model.drift_variance(problem.poses, fit.estimate.state.p)
+    return {"t_mm": float(np.sqrt(variance[3:].mean())), "w_rad": float(np.sqrt(variance[:3].mean()))}
+
+
 def calibration_of(
     rigid: Calibration, fits: Mapping[str, ModelFit], judged: Mapping[str, Judgement], chosen: str, asked: str,
     ids: tuple[str, ...], doubts: tuple[str, ...],
@@ -73,26 +82,26 @@ def calibration_of(
     data = problem.data
     block: dict[str, Any] = {}
     notes: list[str] = []
+    lag = None
     if model is not None:
         before = len(e.problem.tangent) - len(model.names)
         if isinstance(model, WithRunEffects):
-            model = model.machine  # drift and lag of this run are no property of the machine
+            last = model.drift.stop
+            lag = {"names": list(model.names[last:]), "values": e.state.p[last:].tolist()}
+            model = model.machine
             doubts = (*doubts, RUN_EFFECTS_FOUND)
         m = len(model.names)
         u = np.sqrt(np.diag(e.covariance))[before : before + m]
         block = manipulator_block(model, e.state.p[:m], u, problem.poses)
         scale = translation_scale(problem.free, e.state.delta)
         block |= {"translation_scale": scale} if scale != 1.0 else {}
+        block |= {"lag": lag} if lag else {}
         gamma = m - float(np.sum((u / model.sigma) ** 2))
         notes.append(
             f"the radiographs determine {gamma:.1f} of {m} errors of the manipulator; the others, and shifts and turns "
             "of whole plates, which the mount and the ball take up, stay at their priors"
         )
-    block["unmodelled"] = bool(problem.scatter > NOTABLE_SCATTER or isinstance(problem.model, WithRunEffects))
-    block["scatter"] = {
-        "t_mm": problem.repeatability.t_mm * np.sqrt(problem.scatter),
-        "w_rad": problem.repeatability.w_rad * np.sqrt(problem.scatter),
-    }
+    block["scatter"] = scatter_block(fit)
     reasons = [*doubts, *_doubts(fit, judged, chosen)]
     if asked == "slack":
         sentence = determined_turns(e)

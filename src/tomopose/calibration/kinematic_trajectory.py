@@ -101,20 +101,39 @@ def trajectory_jacobian(calibration: Calibration, poses: PoseSequence, points: A
     return flat.reshape(J.shape), J_pose
 
 
+def scatter_of(calibration: Calibration) -> Array:
+    """(6,) variance of (w, t) of the plate from pose to pose, rad^2 and mm^2; 0 where it is not known."""
+    found = calibration.manipulator.get("scatter")
+    if found is not None:
+        return np.repeat([float(found["w_rad"]) ** 2, float(found["t_mm"]) ** 2], 3)
+    noise = calibration.extra.get("pose_noise", {"rotation_rad": 0.0, "translation_mm": 0.0})
+    return np.repeat([float(noise["rotation_rad"]) ** 2, float(noise["translation_mm"]) ** 2], 3)
+
+
+def scatter_variance(calibration: Calibration, poses: PoseSequence, x_M: Any) -> Array:
+    """(n, m, 2) px^2: what the plate's scatter from pose to pose adds to points x_M (m, 3) of the object.
+
+    poses: where the plate stands (corrected).
+    """
+    variance, T_MH = scatter_of(calibration), poses.T_MH
+    V = np.zeros((len(poses), len(x_M), 2))
+    if variance.any():
+        for i, x in enumerate(np.asarray(x_M, dtype=np.float64)):
+            b = projection_blocks(calibration.scanner, T_HT=calibration.T_HT, T_MH=T_MH, t=x, alpha=poses.alpha)
+            J = np.concatenate([-b.G_H @ skew(b.x_H - T_MH.t), b.G_H], axis=2)
+            V[:, i] = (J**2) @ variance
+    return V
+
+
 def trajectory_sigma(
-    calibration: Calibration, poses: PoseSequence, points: Any, *, scatter: bool | None = None
+    calibration: Calibration, poses: PoseSequence, points: Any, *, scatter: bool = False
 ) -> Array:
     """(n, m, 2) px: standard uncertainty of points (m, 3) of W at home in a scan, the object's rigid pose removed.
 
-    scatter: add how far the plate stands off from pose to pose (the identified scatter), for the single view; None:
-    where the run showed wear or more scatter than the repeatability, since a scan will show it again.
+    scatter: add the manipulator's scatter from pose to pose, for the single view; else the part that views share.
     """
     J, J_pose = trajectory_jacobian(calibration, poses, points)
     V = np.einsum("nmic,cd,nmid->nmi", J, calibration.covariance, J, optimize=True)
-    found = calibration.manipulator.get("scatter")
-    if scatter is None:
-        scatter = bool(calibration.manipulator.get("unmodelled", False))
-    if scatter and found is not None:
-        variance = np.repeat([found["w_rad"] ** 2, found["t_mm"] ** 2], 3)
-        V = V + np.einsum("nmia,a,nmia->nmi", J_pose, variance, J_pose, optimize=True)
+    if scatter:
+        V = V + (J_pose**2) @ scatter_of(calibration)
     return np.sqrt(np.maximum(V, 0.0))

@@ -14,11 +14,18 @@ from tomopose.geometry.rotations import log_rotation
 from tomopose.manipulator.pose_map import PoseMap
 from tomopose.units import Array
 
-LEVER_MM = 100.0
-"""How far plate errors act from their cause: turns a size in mm into one in rad where nothing else is known."""
+LEVER_RANGE_MM = (75.0, 300.0)
+"""How far from the plate's origin the joints lie that cause its errors, by a logarithmic prior from a plate's edge to its
+far joints: what turns a size in mm into one in rad where the data do not tell it.  What is stated away from the ball follows from it."""
 SMALLEST_ERROR_MM = 1e-4
 UNDETERMINED_SHARE = 0.25
 """Share of the prior variance of the plate's turns that may be left before they count as not determined."""
+
+
+def lever_mm() -> float:
+    """The lever L whose 1/L^2 is the mean of 1/L^2 over LEVER_RANGE_MM, uniform in log L."""
+    low, high = LEVER_RANGE_MM
+    return float(np.sqrt(2 * np.log(high / low) / (1 / low**2 - 1 / high**2)))
 
 
 def map_candidates(problem: KinematicProblem, start: State) -> list[tuple[str, PoseMap]]:
@@ -33,7 +40,7 @@ def map_candidates(problem: KinematicProblem, start: State) -> list[tuple[str, P
         (
             f"map-{order}",
             PoseMap(
-                order=order, t_scale=t_scale, w_scale=w_scale, t_sigma=2 * left, w_sigma=2 * left / LEVER_MM,
+                order=order, t_scale=t_scale, w_scale=w_scale, t_sigma=2 * left, w_sigma=2 * left / lever_mm(),
                 repeatability=problem.repeatability,
             ),
         )

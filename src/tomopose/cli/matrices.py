@@ -28,13 +28,18 @@ def matrices(
         Path | None,
         typer.Option("--commands", help="Also write what to command so that the real machine reaches the poses."),
     ] = None,
+    home: Annotated[
+        str | None,
+        typer.Option("--home", help="pose_id at which the object has its coordinates in W; default: zero."),
+    ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> int:
     """Turn a scan's poses into one 3x4 projection matrix a view, with the predicted uncertainty in pixels.
 
-    Refuses a scan with another pivot or another scanner than the calibration's.
+    Refuses a scan with another pivot or another scanner than the calibration's.  A robot's zero is far from the
+    scanner: name one of its poses as --home.
     """
     import numpy as np
 
@@ -51,25 +56,40 @@ def matrices(
         require_absent(commands, force=force)
         if cal.model == "rigid":
             raise InputError(f"{calibration} holds no errors of the manipulator; command the poses as they are")
+    at_home = None
+    if home is not None:
+        real = tp.corrected_poses(cal.manipulator, scan)
+        at_home = real.T_MH[int(real.index_of([home])[0])]
     result = tp.projection_matrices(
-        cal, scan, binning=binning, scanner=None if scanner is None else tp.read_scanner(scanner)
+        cal, scan, binning=binning, scanner=None if scanner is None else tp.read_scanner(scanner), home=at_home
     )
     inputs = [calibration, poses, *([scanner] if scanner else [])]
     tp.write_matrices(
-        out, result, provenance=provenance(inputs=inputs, arguments=arguments(binning=binning)), force=force
+        out, result, provenance=provenance(inputs=inputs, arguments=arguments(binning=binning, home=home)), force=force
     )
     if commands is not None:
         tp.write_poses(commands, tp.commands_for(cal.manipulator, scan), force=force)
     if "kind" in cal.manipulator:
         for note in correction(cal.manipulator, scan).notes:
             say.note(f"note: {note}")
-    sigma = None if result.points_sigma is None else float(np.sqrt(np.mean(result.points_sigma**2)))
-    told = "not determinable" if sigma is None else f"{sigma:.2g} px (1 sigma, rms over the field of view)"
+    sigma, shared = (
+        None if s is None else float(np.sqrt(np.mean(s**2))) for s in (result.points_sigma, result.points_sigma_shared)
+    )
+    told = "not determinable"
+    if sigma is not None and shared is not None:
+        own = float(np.sqrt(max(sigma**2 - shared**2, 0.0)))
+        told = f"{sigma:.2g} px (1 sigma a coordinate of the single view, rms over the field of view)"
+        told += f": {shared:.2g} px of the calibration, shared by all views, and "
+        told += f"{own:.2g} px of the manipulator's scatter" if own else "no known scatter of the manipulator"
     say.result(
         {"out": out.name, "views": len(result), "n_u_px": result.n_u, "n_v_px": result.n_v, "points_sigma_px": sigma,
+         "points_sigma_shared_px": shared,
          "calibration_verdict": cal.verdict},
         [f"{out}: {len(result)} matrices for images of {result.n_u} x {result.n_v} px; uncertainty {told}"],
     )
+    if home is None and (result.P[:, 2, 3] <= 0).any():
+        say.note("note: at the machine's zero the W origin lies behind the source; a pose of the scan as --home puts "
+                 "the object near it")
     if cal.verdict != "trustworthy":
         say.note(f"note: the calibration's verdict is {cal.verdict}: {'; '.join(cal.reasons)}")
     return OK

@@ -60,12 +60,14 @@ def project_ball(
 
 
 def eq5_matrices(
-    scanner: Scanner, *, T_HT: RigidTransform, T_MH: RigidTransform, alpha: Array | float = 0.0
+    scanner: Scanner, *, T_HT: RigidTransform, T_MH: RigidTransform, alpha: Array | float = 0.0,
+    home: RigidTransform | None = None,
 ) -> Array:
     """The matrices P_j (n, 3, 4) that take points of W, object at home, to pixels.  Eq. (5).
 
     Home is table angle 0 and manipulator at zero, so that x_W0 = home x_M; the printed T_HT^-1 of eq. (5) stands for
-    the inverse of (T_TW,0 T_HT T_MH,0) with two identities.  |P[2, :3]| = 1 and w is the depth in mm.
+    the inverse of (T_TW,0 T_HT T_MH,0) with two identities.  home: another T_MH,0, such as a robot's working pose,
+    whose zero is far from the scanner.  |P[2, :3]| = 1 and w is the depth in mm.
     """
     T_HT, T_MH = T_HT.require(Frame.H, Frame.T), T_MH.require(Frame.M, Frame.H)
     n = len(T_MH)
@@ -73,7 +75,8 @@ def eq5_matrices(
     T_HT_n = RigidTransform(
         R=np.broadcast_to(T_HT.R, (n, 3, 3)), t=np.broadcast_to(T_HT.t, (n, 3)), source=Frame.H, target=Frame.T
     )
-    home = scanner.T_TW(0.0) @ T_HT @ RigidTransform.identity(Frame.M, Frame.H)
+    T_MH_0 = RigidTransform.identity(Frame.M, Frame.H) if home is None else home.require(Frame.M, Frame.H)
+    home = scanner.T_TW(0.0) @ T_HT @ T_MH_0
     home_inv = RigidTransform(
         R=np.broadcast_to(home.inv.R, (n, 3, 3)), t=np.broadcast_to(home.inv.t, (n, 3)), source=Frame.W, target=Frame.M
     )
@@ -81,8 +84,12 @@ def eq5_matrices(
     return scanner.P_S @ (scanner.T_WS.matrix @ chain.matrix)
 
 
-def canonical(P: Any) -> Array:
-    """P scaled to |P[2, :3]| = 1 with w > 0 at the W origin (field convention: P[2, 3] > 0)."""
+def canonical(P: Any, in_front: Any = (0.0, 0.0, 0.0)) -> Array:
+    """P scaled to |P[2, :3]| = 1 with w > 0 at the point `in_front` of W, mm.
+
+    The origin is the field's convention (P[2, 3] > 0).  A robot that stands behind the source puts the origin of W at
+    home there too; a point of its object then tells the sign.
+    """
     P = np.asarray(P, dtype=np.float64)
     if P.shape[-2:] != (3, 4):
         raise ShapeError(f"projection matrices are (n, 3, 4); got {P.shape}")
@@ -91,7 +98,8 @@ def canonical(P: Any) -> Array:
     norm = np.linalg.norm(P[..., 2, :3], axis=-1)
     if (norm == 0).any():
         raise InputError(f"view {np.flatnonzero(norm == 0)[0]}: the third row of P is zero; not a cone-beam projection")
-    sign = np.where(P[..., 2, 3] < 0, -1.0, 1.0)
+    depth = P[..., 2, :3] @ np.asarray(in_front, dtype=np.float64) + P[..., 2, 3]
+    sign = np.where(depth < 0, -1.0, 1.0)
     return P * (sign / norm)[..., None, None]
 
 
@@ -120,13 +128,15 @@ class ViewGeometry:
         return n * sign[:, None]
 
 
-def decompose(P: Any, *, n_u: int, n_v: int, p_u: float, p_v: float) -> ViewGeometry:
-    """Source and panel of matrices P (n, 3, 4), given the panel's size and pitch.
+def decompose(
+    P: Any, *, n_u: int, n_v: int, p_u: float, p_v: float, in_front: Any = (0.0, 0.0, 0.0)
+) -> ViewGeometry:
+    """Source and panel of matrices P (n, 3, 4), given the panel's size and pitch; in_front as in `canonical`.
 
     P alone fixes only d_SD / pitch.  A matrix with skew or with an aspect that differs from p_u / p_v has no flat panel
     of that pitch: InputError names the view; nothing is rounded.
     """
-    P = canonical(P)
+    P = canonical(P, in_front)
     M_inv = np.linalg.inv(P[:, :, :3])
     a, b, c = M_inv[:, :, 0], M_inv[:, :, 1], M_inv[:, :, 2]
     len_a, len_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
@@ -175,8 +185,10 @@ class ProjectionMatrices:
     """Projection matrices of a scan: points of W (mm) to pixels of D.
 
     P: (n, 3, 4), kept at |P[2, :3]| = 1, w > 0.  n_u, n_v: detector size.  p_u, p_v: pitch, mm (P does not fix it).
-    pose_id: n names.  points_sigma: (n, m) predicted standard uncertainty, px, of points over the field of view, where
-    the calibration has a covariance.  scanner: the scanner they were made for, where known.
+    pose_id: n names.  points_sigma: (n, m) predicted standard uncertainty, px, of points over the field of view in the
+    single view, where the calibration has a covariance.  points_sigma_shared: (n, m) the part of it that comes from the
+    calibration and is shared by all views; the rest is the manipulator's scatter from pose to pose.  scanner: the
+    scanner they were made for, where known.  in_front: (3,) mm, a point of W that lies in front of the source.
     """
 
     P: Array
@@ -186,13 +198,19 @@ class ProjectionMatrices:
     p_v: float
     pose_id: tuple[str, ...]
     points_sigma: Array | None = None
+    points_sigma_shared: Array | None = None
     scanner: Scanner | None = None
+    in_front: Any = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        in_front = float_array(self.in_front)
+        if in_front.shape != (3,) or not np.isfinite(in_front).all():
+            raise InputError(f"in_front is {self.in_front!r}; a point (x, y, z) of W in mm is needed")
+        object.__setattr__(self, "in_front", in_front)
         P = np.asarray(self.P, dtype=np.float64)
         if P.ndim != 3:
             raise ShapeError(f"projection matrices are (n, 3, 4); got {P.shape}")
-        P = float_array(canonical(P))
+        P = float_array(canonical(P, in_front))
         if len(P) == 0:
             raise InputError("there are no projection matrices")
         if len(self.pose_id) != len(P):
@@ -207,8 +225,9 @@ class ProjectionMatrices:
                 raise InputError(f"{name} is {value!r} mm; a positive pitch is needed")
         object.__setattr__(self, "P", P)
         object.__setattr__(self, "pose_id", tuple(str(i) for i in self.pose_id))
-        if self.points_sigma is not None:
-            object.__setattr__(self, "points_sigma", float_array(self.points_sigma))
+        for name in ("points_sigma", "points_sigma_shared"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, float_array(getattr(self, name)))
 
     def __len__(self) -> int:
         return len(self.P)
@@ -219,7 +238,9 @@ class ProjectionMatrices:
 
     def decompose(self) -> ViewGeometry:
         """Source and panel of each view."""
-        return decompose(self.P, n_u=self.n_u, n_v=self.n_v, p_u=self.p_u, p_v=self.p_v)
+        return decompose(
+            self.P, n_u=self.n_u, n_v=self.n_v, p_u=self.p_u, p_v=self.p_v, in_front=self.in_front
+        )
 
     def top_first(self) -> Array:
         """The matrices for arrays whose row 0 is the top: F P."""
@@ -233,6 +254,7 @@ class ProjectionMatrices:
             P=self.P[index],
             pose_id=tuple(self.pose_id[i] for i in index),
             points_sigma=None if self.points_sigma is None else self.points_sigma[index],
+            points_sigma_shared=None if self.points_sigma_shared is None else self.points_sigma_shared[index],
         )
 
     def binned(self, factor: int) -> ProjectionMatrices:
@@ -249,6 +271,7 @@ class ProjectionMatrices:
             p_u=self.p_u * factor,
             p_v=self.p_v * factor,
             points_sigma=None if self.points_sigma is None else self.points_sigma / factor,
+            points_sigma_shared=None if self.points_sigma_shared is None else self.points_sigma_shared / factor,
             scanner=None if self.scanner is None else self.scanner.binned(factor),
         )
 

@@ -17,7 +17,8 @@ from tomopose.io.table_text import unknown_column
 from tomopose.provenance import Provenance
 
 REQUIRED = ("P", "n_u", "n_v", "p_u", "p_v", "pose_id")
-KNOWN = ("schema", *REQUIRED, "P_points_sigma_px", "scanner", "provenance")
+SIGMA = {"P_points_sigma_px": "points_sigma", "P_points_sigma_shared_px": "points_sigma_shared"}
+KNOWN = ("schema", *REQUIRED, *SIGMA, "in_front_mm", "scanner", "provenance")
 
 
 def write_matrices(
@@ -34,8 +35,9 @@ def write_matrices(
         "p_v": np.float64(P.p_v),
         "pose_id": np.array(P.pose_id, dtype=np.str_),
     }
-    if P.points_sigma is not None:
-        content["P_points_sigma_px"] = P.points_sigma
+    content |= {key: getattr(P, name) for key, name in SIGMA.items() if getattr(P, name) is not None}
+    if P.in_front.any():
+        content["in_front_mm"] = P.in_front
     if P.scanner is not None:
         content["scanner"] = json.dumps({"schema": "tomopose/scanner/1", **scanner_document(P.scanner)})
     if provenance is not None:
@@ -74,8 +76,9 @@ def read_matrices(path: str | Path) -> ProjectionMatrices:
             p_u=float(content["p_u"]),
             p_v=float(content["p_v"]),
             pose_id=tuple(content["pose_id"].tolist()),
-            points_sigma=content.get("P_points_sigma_px"),
             scanner=scanner,
+            in_front=content.get("in_front_mm", np.zeros(3)),
+            **{name: content.get(key) for key, name in SIGMA.items()},
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

@@ -4,8 +4,9 @@
 
     {"kind": "hexapod" | "serial" | "map",  "nominal": the machine as in its file,
      "names", "values", "units", "u": of its errors,
-     "scatter": {"t_mm", "w_rad"} of the plate from pose to pose, "unmodelled": whether the run showed wear or more
-     of it than the repeatability,
+     "scatter": {"t_mm", "w_rad"} of the plate from pose to pose, with the drift that the run showed,
+     "lag": {"names", "values"} of worn guides and drives, where the run showed it: it follows the direction from which
+     a table's poses are approached, in their order,
      "translation_scale": factor on the plate's shifts, where it was freed and is not 1,
      "range": {"t_mm": [low (3), high (3)], "w_rad": [low, high]}: of the calibration's poses}
 
@@ -29,7 +30,8 @@ from tomopose.manipulator.files import hexapod_from_document, serial_from_docume
 from tomopose.manipulator.inverse import InverseManipulator
 from tomopose.manipulator.pose_map import PoseMap
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.manipulator.real_poses import ErrorModel, Repeatability, moved
+from tomopose.manipulator.real_poses import ErrorModel, RealPoses, Repeatability, moved
+from tomopose.manipulator.run_effects import with_run_effects
 from tomopose.manipulator.serial import SerialRobot
 from tomopose.units import Array
 
@@ -100,10 +102,27 @@ def _machine(kind: str, nominal: Mapping[str, Any], where: str) -> ErrorModel:
     if kind == "map":
         return PoseMap(
             order=int(nominal["order"]), t_scale=nominal["t_scale_mm"], w_scale=nominal["w_scale_rad"],
-            t_sigma=nominal["t_sigma_mm"], w_sigma=nominal["w_sigma_rad"],
+            t_sigma=nominal["t_sigma_mm"], w_sigma=nominal["w_sigma_rad"], factors=nominal.get("factors"),
             repeatability=Repeatability(**nominal["repeatability"]),
         )
     raise InputError(f"{where} has kind {kind!r}; hexapod, serial, map and inverse are known")
+
+
+def _executed(
+    manipulator: Mapping[str, Any], poses: PoseSequence, moves: PoseSequence
+) -> tuple[RealPoses, tuple[str, ...]]:
+    """Where the real plate stands for commanded poses, with lags as of the table `moves`, and the errors' names."""
+    model, p = model_from_block(manipulator)
+    lag = manipulator.get("lag")
+    if lag is None:
+        return model.real_poses(poses, p), model.names
+    worn = with_run_effects(model, moves)
+    values, still = np.array(lag["values"], dtype=np.float64), worn.drift
+    if tuple(lag["names"]) != worn.names[still.stop :] or values.shape != (len(worn.names) - still.stop,):
+        raise InputError(f"calibration: manipulator: names and values of the lag do not fit a {model.kind}")
+    real = worn.real_poses(poses, np.concatenate([p, np.zeros(still.stop - still.start), values]))
+    J = np.delete(real.J, np.arange(still.start, still.stop), axis=2)
+    return replace(real, J=J), (*model.names, *worn.names[still.stop :])
 
 
 def correction(manipulator: Mapping[str, Any], poses: PoseSequence) -> Correction:
@@ -114,8 +133,7 @@ def correction(manipulator: Mapping[str, Any], poses: PoseSequence) -> Correctio
     n = len(poses)
     if "kind" not in manipulator:
         return Correction(poses=poses, J=np.zeros((n, 6, 0)), names=(), outside=np.zeros(n, dtype=bool))
-    model, p = model_from_block(manipulator)
-    real = model.real_poses(poses, p)
+    real, names = _executed(manipulator, poses, poses)
     scale = float(manipulator.get("translation_scale", 1.0))
     T_MH = replace(real.T_MH, t=scale * real.t)
     J = np.concatenate([real.J[:, :3], scale * real.J[:, 3:]], axis=1)
@@ -127,7 +145,7 @@ def correction(manipulator: Mapping[str, Any], poses: PoseSequence) -> Correctio
             f"{int(outside.sum())} of {n} poses lie outside the range in which the manipulator's errors were "
             f"identified, the first is {poses.pose_id[first]!r}; there the correction rests on the model alone",
         )
-    return Correction(poses=replace(poses, T_MH=T_MH), J=J, names=model.names, outside=outside, notes=notes)
+    return Correction(poses=replace(poses, T_MH=T_MH), J=J, names=names, outside=outside, notes=notes)
 
 
 def corrected_poses(manipulator: Mapping[str, Any], poses: PoseSequence) -> PoseSequence:
@@ -143,14 +161,14 @@ def commands_for(manipulator: Mapping[str, Any], wanted: PoseSequence) -> PoseSe
     """
     if "kind" not in manipulator:
         return wanted
-    model, p = model_from_block(manipulator)
+    model, _ = model_from_block(manipulator)
     command = replace(wanted, q=None)
     extra = None
     if isinstance(model, SerialRobot):
         q, extra = model.joint_values(wanted)
         command = replace(wanted, q=q)
     for _ in range(COMMAND_STEPS):
-        real = model.real_poses(command, p)
+        real, _ = _executed(manipulator, command, wanted)
         w = log_rotation(wanted.T_MH.R @ np.swapaxes(real.R, 1, 2))
         delta = np.concatenate([w, wanted.T_MH.t - real.t], axis=1)
         miss = np.maximum(np.abs(delta[:, :3]).max(axis=1) * 1000.0, np.abs(delta[:, 3:]).max(axis=1))

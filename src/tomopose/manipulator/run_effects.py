@@ -4,8 +4,8 @@ r"""What happened during one run and is no part of the machine's geometry: drift
 
 tau in [-1, 1] is the place of the pose in the run, P_i Legendre's polynomials (the constant belongs to T_HT); the lag
 of a worn guide (coordinate c) or drive (leg or joint d, which moves the plate by J_d) follows the direction from which
-a pose was approached.  These numbers are estimated beside the errors so that they do not bend them; they say nothing
-about another run and are not applied to a scan.
+a pose was approached.  These numbers are estimated beside the errors so that they do not bend them.  Of another run the
+drift says only how far it may go; the lags belong to the machine and follow a scan's own moves.
 """
 
 from __future__ import annotations
@@ -73,16 +73,31 @@ class WithRunEffects:
         """Poses of the real plate in this run, and their derivative by errors and effects."""
         m = len(self.machine.names)
         real = self.machine.real_poses(poses, p[:m])
-        phi = legvander(np.array([self.tau[i] for i in poses.pose_id]), DRIFT_ORDER)[:, 1:]
-        drift = phi[:, None, :, None] * np.eye(6)[None, :, None, :]
-        lags = np.array([self.lags[i] for i in poses.pose_id])
-        J_effects = np.concatenate([drift.reshape(len(poses), 6, -1), lags], axis=2)
+        J_effects = self._effects(poses)
         delta = J_effects @ p[m:]
         R, t = moved(real.R, real.t, delta)
         J_effects[:, :3] = left_jacobian(delta[:, :3]) @ J_effects[:, :3]
         J_machine = real.J.copy()
         J_machine[:, :3] = exp_rotation(delta[:, :3]) @ real.J[:, :3]
         return RealPoses(R=R, t=t, J=np.concatenate([J_machine, J_effects], axis=2))
+
+    def _effects(self, poses: PoseSequence) -> Array:
+        """(n, 6, k): the plate's motion (w, t) by each effect."""
+        phi = legvander(np.array([self.tau[i] for i in poses.pose_id]), DRIFT_ORDER)[:, 1:]
+        drift = phi[:, None, :, None] * np.eye(6)[None, :, None, :]
+        lags = np.array([self.lags[i] for i in poses.pose_id])
+        return np.concatenate([drift.reshape(len(poses), 6, -1), lags], axis=2)
+
+    @property
+    def drift(self) -> slice:
+        """Where the drift stands in p; the lags follow it."""
+        m = len(self.machine.names)
+        return slice(m, m + DRIFT_ORDER * len(COORDINATES))
+
+    def drift_variance(self, poses: PoseSequence, p: Array) -> Array:
+        """(6,) rad^2, mm^2: how far the drift moved the plate in this run, about its mean."""
+        k = DRIFT_ORDER * len(COORDINATES)
+        return np.var(self._effects(poses)[:, :, :k] @ p[self.drift], axis=0)
 
     def resized(self, size: float) -> WithRunEffects:
         return replace(self, machine=self.machine.resized(size))
