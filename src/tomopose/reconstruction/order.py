@@ -1,7 +1,7 @@
 """In which order the views are used.
 
 Order matters more than anything else in one iteration of SART: neighbouring views in sequence leave 0.2 voxel of centre
-error where a spread order leaves 0.002 (docs/concepts/reconstruction.md).
+error where a spread order leaves 0.002 (docs/validation/reconstruction.md).
 """
 
 from __future__ import annotations

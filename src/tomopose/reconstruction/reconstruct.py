@@ -40,7 +40,7 @@ PAPER: dict[str, Any] = {"algorithm": "sart", "iterations": 1, "relaxation": 0.8
 """As in Butzhammer et al., Meas. Sci. Technol. 34 (2023) 015403, sec. 6.2: one iteration of SART, relaxation 0.8.
 
 The paper does not say in which order the views were taken.  From zero, one sweep in random order left ball centres
-0.003 voxel beside their place, in golden order 0.008 (docs/concepts/reconstruction.md).
+0.003 voxel beside their place, in golden order 0.008 (docs/validation/reconstruction.md).
 """
 
 
