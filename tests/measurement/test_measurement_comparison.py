@@ -100,6 +100,34 @@ def test_signed_distances_are_exact(rng):
     assert np.abs(signed_distances(x, mesh) - truth).max() < 1e-6
 
 
+def test_the_sign_is_right_at_sharp_corners_too(rng):
+    """A thin spike: its tip and edges are nearest for many points; VTK's own distances as the other opinion."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
+    from vtkmodules.vtkCommonCore import vtkDoubleArray, vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+    from vtkmodules.vtkFiltersCore import vtkImplicitPolyDataDistance
+
+    points = np.array([[0.0, 0, 5], [0.3, 0, 0], [-0.2, 0.3, 0], [-0.2, -0.3, 0]])
+    mesh = Mesh(points=points, faces=[[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]]).require_closed()
+    x = rng.uniform([-1, -1, -1], [1, 1, 7], (3000, 3))
+    found = signed_distances(x, mesh)
+    corners, cells, data, out = vtkPoints(), vtkCellArray(), vtkPolyData(), vtkDoubleArray()
+    corners.SetDataTypeToDouble()
+    corners.SetData(numpy_to_vtk(points, deep=True))
+    cells.SetData(3, numpy_to_vtkIdTypeArray(mesh.faces.astype(np.int64).ravel(), deep=True))
+    data.SetPoints(corners)
+    data.SetPolys(cells)
+    function = vtkImplicitPolyDataDistance()
+    function.SetInput(data)
+    function.FunctionValue(numpy_to_vtk(x, deep=True), out)
+    assert np.abs(found - vtk_to_numpy(out)).max() < 1e-12
+    n = mesh.face_normals / np.linalg.norm(mesh.face_normals, axis=1)[:, None]
+    inside = (np.einsum("nfj,fj->nf", x[:, None] - points[mesh.faces[:, 0]], n) < 0).all(axis=1)
+    assert ((found < 0) == inside).all()
+    with pytest.raises(InputError, match="not finite"):
+        signed_distances(np.full((2, 3), np.nan), mesh)
+
+
 def test_elements_and_edges_of_a_box(mesh):
     assert len(np.unique(mesh.elements)) == 6
     assert mesh.on_edge.sum() == 12 * 11 + 8

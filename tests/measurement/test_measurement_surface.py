@@ -12,6 +12,7 @@ from tomopose.errors import InputError, ShapeError
 from tomopose.measurement.edge_search import EdgeFlag, EdgeSettings
 from tomopose.measurement.fits import fit_plane, fit_sphere
 from tomopose.measurement.histogram import given_levels, grey_levels
+from tomopose.measurement.plateaus import neighbour_medians
 from tomopose.measurement.probing import plane_pattern, probe, sphere_pattern
 from tomopose.measurement.surface import surface, surfaces
 from tomopose.volume import Volume, VoxelGrid
@@ -79,6 +80,28 @@ def test_drift_spoils_the_fixed_level_but_not_the_local_edge(balls, drifting):
     local = errors(surface(drifting), grid, centres)[1]
     assert np.std(fixed) > 0.05
     assert np.std(local) < 0.006
+
+
+def test_shared_plateaus_scatter_less_than_a_fixed_level_where_grey_drifts(balls, drifting):
+    """D95 of the balls, mean: quieter than ISO-50, and than edges with plateaus of their own."""
+    _, centres = balls
+
+    def form(found):
+        near = np.argmin(np.linalg.norm(found.points[:, None] - centres, axis=2), axis=1)
+        return np.mean([fit_sphere(found.points[(near == k) & found.good]).form_95 for k in range(len(centres))])
+
+    fixed, own, shared = (form(surface(drifting, method=m, edges=e)) for m, e in (
+        ("iso-50", None), ("esf", EdgeSettings(plateau_radius=0.0)), ("esf", None)))
+    assert shared < 0.9 * fixed
+    assert shared < 0.85 * own
+
+
+def test_the_median_of_neighbours_stays_on_its_side_of_a_wall():
+    x = np.array([[0.0, 0, 0], [0.5, 0, 0], [0, 0, 0.1], [9, 9, 9]])
+    n = np.array([[0.0, 0, 1], [0, 0, 1], [0, 0, -1], [0, 0, 1]])
+    median, count = neighbour_medians(x, n, np.array([[1.0], [3.0], [100.0], [7.0]]), 1.0)
+    assert median[:, 0].tolist() == [2.0, 2.0, 100.0, 7.0]
+    assert count.tolist() == [2, 2, 1, 1]
 
 
 def test_the_local_half_agrees_with_the_fitted_step_on_clean_data(balls, clean):
@@ -173,7 +196,8 @@ def test_stated_intervals_hold_the_truth():
         rng = np.random.default_rng(np.random.SeedSequence([17, run]))
         height = rng.uniform(-0.05, 0.05)
         values = ndtr((height - z) / 0.1)[:, None, None] + 0.05 * rng.standard_normal(grid.shape)
-        found = probe(as_volume(values, grid), points, normals, settings=EdgeSettings(sigma=0.1), contrast=1.0)
+        own = EdgeSettings(sigma=0.1, plateau_radius=0.0)
+        found = probe(as_volume(values, grid), points, normals, settings=own, contrast=1.0)
         plane = fit_plane(found.points[found.good], outliers=3.0, correlation_range=0.6)
         error, u = plane.point[2] - height, plane.u[2]
         held += abs(error) <= t.ppf(0.975, plane.dof) * u
@@ -221,7 +245,8 @@ class TestBadInput:
             probe(clean, np.zeros((3, 2)), np.zeros((3, 2)))
 
     def test_settings(self):
-        for bad in ({"search_distance": 0.0}, {"window": 0.5}, {"contrast_threshold": 1.0}, {"sigma": -1.0}):
+        for bad in ({"search_distance": 0.0}, {"window": 0.5}, {"contrast_threshold": 1.0}, {"sigma": -1.0},
+                    {"plateau_radius": -1.0}):
             with pytest.raises(InputError):
                 EdgeSettings(**bad)
 

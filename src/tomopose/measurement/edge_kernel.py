@@ -21,10 +21,11 @@ GAUSS_NEWTON = 12
 RECENTRINGS = 3
 AGAIN = 0.3
 """Share of the contrast by which grey must come back for a second edge."""
-S, A, B, RMS, S_VARIANCE, INNER_SLOPE, OUTER_SLOPE, D_SIGMA, D_SIGMA_2 = range(9)
+S, A, B, RMS, S_VARIANCE, INNER_SLOPE, OUTER_SLOPE, D_SIGMA, D_SIGMA_2, S_BY_A, S_BY_B, S_VARIANCE_HELD = range(12)
 """Columns of a result: s_0, a, b, rms of the fit, variance of s_0 for unit noise, differences of the two halves of
-each plateau, and the sums that a common step in sigma is made of."""
-N_COLUMNS = 9
+each plateau, the sums that a common step in sigma is made of, by how much s_0 moves with a and b held elsewhere, and
+its variance then (only where a step was fitted)."""
+N_COLUMNS = 12
 BORDER, NO_EDGE, THIN, NOT_CONVERGED = 1, 2, 4, 8
 
 
@@ -150,6 +151,7 @@ def _fit_edge(g: Any, sigma: Any, window: Any, start: Any, a: Any, b: Any, out: 
     out[S], out[A], out[B] = s_0, a, b
     det = h11 * (h22 * h33 - h23 * h23) - h12 * (h12 * h33 - h13 * h23) + h13 * (h12 * h23 - h13 * h22)
     out[S_VARIANCE] = (h22 * h33 - h23 * h23) / det
+    out[S_BY_A], out[S_BY_B], out[S_VARIANCE_HELD] = -h12 / h11, -h13 / h11, 1.0 / h11
     _judge(g, sigma, window, s_0, a, b, out)
     return converged
 

@@ -10,7 +10,7 @@ Each line starts at a point and runs along a normal from material to background.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
 from typing import Any, Literal
 
@@ -18,6 +18,7 @@ import numpy as np
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.measurement import edge_kernel as kernel
+from tomopose.measurement.plateaus import neighbour_medians
 from tomopose.measurement.splines import REACH, spline_coefficients
 from tomopose.units import Array, float_array
 from tomopose.volume import Volume
@@ -54,6 +55,7 @@ class EdgeSettings:
     contrast_threshold: share of the global contrast below which an edge is not believed.
     method:             esf: fit of a blurred step; local-50: 50 % between the plateaus.
     sigma:              standard deviation of the blur, mm; estimated from the edges where None.
+    plateau_radius:     neighbours within so many voxels share their plateaus (esf); 0 leaves each edge its own.
     """
 
     search_distance: float = 2.0
@@ -61,6 +63,7 @@ class EdgeSettings:
     contrast_threshold: float = 0.2
     method: Method = "esf"
     sigma: float | None = None
+    plateau_radius: float = 3.0
 
     def __post_init__(self) -> None:
         if not self.search_distance > 0:
@@ -73,6 +76,8 @@ class EdgeSettings:
             raise InputError(f"method is {self.method!r}; 'esf' or 'local-50' is needed")
         if self.sigma is not None and not self.sigma > 0:
             raise InputError(f"sigma is {self.sigma} mm; a positive length is needed")
+        if not 0 <= self.plateau_radius <= 50:
+            raise InputError(f"plateau_radius is {self.plateau_radius} voxels; 0 to 50 is possible")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -150,7 +155,10 @@ def search_edges(
             result[rows], flags[rows] = _piece(volume, index[rows], step[rows], sigma, window, settings)
         if progress is not None:
             progress(done + 1, len(starts))
-    return _judged(result, flags, sigma, window, unit, settings, contrast)
+    edges = _judged(result, flags, sigma, window, unit, settings, contrast)
+    if settings.method != "esf" or settings.plateau_radius == 0:
+        return edges
+    return _shared(edges, result, x, n, unit, settings.plateau_radius)
 
 
 def _checked(points: Any, normals: Any) -> tuple[Array, Array]:
@@ -243,3 +251,19 @@ def _judged(
         outside=result[:, kernel.B], residual=result[:, kernel.RMS], u=np.where(bad, np.nan, u * unit), flags=flags,
         sigma=sigma * unit, window=window * unit,
     )
+
+
+def _shared(edges: Edges, result: Array, points: Array, normals: Array, unit: float, radius: float) -> Edges:
+    """The edges with their plateaus shared among neighbours, see `plateaus`; flags and residuals stay their own."""
+    rows = np.flatnonzero(edges.good)
+    if not rows.size:
+        return edges
+    own = result[rows][:, [kernel.A, kernel.B]]
+    levels, count = neighbour_medians(points[rows], normals[rows], own, radius * unit)
+    offset, u = np.array(edges.offset), np.array(edges.u)
+    inside, outside = np.array(edges.inside), np.array(edges.outside)
+    offset[rows] += unit * np.sum(result[rows][:, [kernel.S_BY_A, kernel.S_BY_B]] * (levels - own), axis=1)
+    inside[rows], outside[rows] = levels.T
+    held, free = result[rows, kernel.S_VARIANCE_HELD], result[rows, kernel.S_VARIANCE]
+    u[rows] = unit * result[rows, kernel.RMS] * np.sqrt((held + (free - held) / count) / kernel.STEP)
+    return replace(edges, offset=offset, u=u, inside=inside, outside=outside)

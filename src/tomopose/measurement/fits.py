@@ -152,8 +152,9 @@ def _fit(
     x, s = _checked(kind, points, sigma)
     if outliers is not None and not outliers > 0:
         raise InputError(f"outliers is {outliers}; a positive number of rms, or None, is needed")
-    used = np.ones(len(x), dtype=bool)
+    keep = np.ones(len(x), dtype=bool)
     for _ in range(MAX_OUTLIER_ROUNDS):
+        used = keep
         vector, blocks = fit(x[used], s[used])
         d = feature_distances(kind, vector, x)
         if outliers is None:
@@ -164,7 +165,6 @@ def _fit(
             raise InputError(f"outlier rule {outliers:g} rms leaves {int(keep.sum())} of {len(x)} points for a {kind}")
         if np.array_equal(keep, used):
             break
-        used = keep
     shares = [_covariance(b, x[used], correlation_range) for b in blocks]
     return Feature(
         kind=kind, vector=vector, covariance=sum((c for c, _ in shares), np.zeros((8, 8))), points=x, used=used,

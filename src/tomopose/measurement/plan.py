@@ -40,6 +40,7 @@ class SurfacePlan(_Strict):
     window_voxel: Positive | None = None
     contrast_threshold: Annotated[float, Field(ge=0, lt=1)] = 0.2
     sigma_mm: Positive | None = None
+    plateau_radius_voxel: Length = 3.0
     curvature_correction: bool = False
     background: float | None = None
     material: float | None = None
