@@ -15,19 +15,31 @@ from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.simulation.attenuate import attenuated
+from tomopose.simulation.cells import (
+    HELD,
+    LATTICE_5,
+    LATTICE_13,
+    LATTICE_55,
+    LATTICE_233,
+    add,
+    add_moments,
+    fill_smooth,
+    gather_value,
+)
 from tomopose.simulation.mesh import MeshSolid
 from tomopose.simulation.raster import fill, gather, projected, sample, touching
 from tomopose.simulation.rays import LARGEST, Compiled
 from tomopose.simulation.sampling import kernel_scene, lengths, work_space
-from tomopose.simulation.smooth import add, fill_smooth
 from tomopose.simulation.spectrum import Beam
 from tomopose.simulation.view import View, Window, in_bands
 from tomopose.units import Array
 
-LATTICES = np.array([(5, 3), (13, 8), (89, 55)])
-"""Fibonacci lattices (n, k) of a cell."""
-STEEP = np.array([2e-3, 2.5e-2])
-"""Differences of transmission over a pixel from which on the second and the third lattice are used."""
+SMOOTH = 1e-3
+"""Largest third difference of transmission over the corners that counts as smooth: the kinks between facets stay below
+it where they matter to nobody."""
+FLAT, STEEP, STEEPEST = 2e-3, 2e-2, 0.1
+"""How far the transmission over a pixel may lie from the bilinear one of its corners to count as flat; and to be sampled
+on the second and on the third lattice."""
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -44,6 +56,8 @@ def _reach(c: Any, u: float, v: float) -> float:
 def _transmission(c: Any, work: Any, Q: Any, L: Any, u: float, v: float) -> Any:
     """(transmission, signature of the solids) of a ray that has the signed q sums Q (m,) in the meshes."""
     signature = lengths(c, work, u, v)
+    if signature == 0 and not Q.any():
+        return 1.0, signature
     d = _reach(c, u, v)
     for m in range(len(Q)):
         L[m] = work[2][m] + max(Q[m], 0.0) * d
@@ -86,43 +100,50 @@ def _rough_cells(
 ) -> None:
     """Add weight x moments of the cells of rough pixels in rows j_0 to j_1 to `out`."""
     work, h = work_space(c, depth), 1.0 / f
-    Q, L = np.empty(len(work[2])), np.empty(len(work[2]))
+    Q, L, M = np.empty(len(work[2])), np.empty(len(work[2])), np.empty(HELD)
     most = 1
     for j in range(j_0, j_1):
         for i in range(rough.shape[1]):
             most = max(most, count[j, i])
-    edges, planes, columns = np.empty((most, 3, 6)), np.empty((most, 7)), np.empty(most, dtype=np.int64)
+    edges, planes, columns = np.empty((most, 3, 6)), np.empty((most, 11)), np.empty(most, dtype=np.int64)
     for j in range(j_0, j_1):
         for i in range(rough.shape[1]):
             if not rough[j, i]:
                 continue
             k = count[j, i]
             gather(P, lists[start[j, i] : start[j, i] + k], edges, planes, columns)
-            least = min(I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1])
-            most_I = max(I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1])
+            f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
+            off, bump = 0.0, 0.0
+            for q in range(5):
+                x, y = LATTICE_5[q, 0] + 0.5, LATTICE_5[q, 1] + 0.5
+                Q[:] = 0.0
+                sample(k, edges, planes, columns, P[6], i + x, j + y, Q)
+                value, _ = _transmission(c, work, Q, L, u_0 + i + x, v_0 + j + y)
+                value -= (1 - y) * ((1 - x) * f_00 + x * f_01) + y * ((1 - x) * f_10 + x * f_11)
+                off, bump = max(off, abs(value)), bump + value / 5
+            if off < FLAT:
+                twist = f_11 - f_10 - f_01 + f_00
+                for a in range(f):
+                    y = (a + 0.5) * h
+                    for b in range(f):
+                        x = (b + 0.5) * h
+                        s_u, s_v = f_01 - f_00 + y * twist, f_10 - f_00 + x * twist
+                        m = f_00 + x * (f_01 - f_00) + y * s_v + bump
+                        add(out, j * f + a, i * f + b, weight * m, weight * s_u, weight * s_v, weight * twist, 0.0, 0.0)
+                continue
+            points = LATTICE_13 if off < STEEP else LATTICE_55 if off < STEEPEST else LATTICE_233
+            n, xy = len(points), (points[:, 0] * points[:, 1]).mean()
             for a in range(f):
                 for b in range(f):
-                    for level in range(3):
-                        if level > 0 and most_I - least < STEEP[level - 1]:
-                            continue
-                        n, step = LATTICES[level]
-                        m = m_u = m_v = m_uv = 0.0
-                        for q in range(n):
-                            x, y = (q + 0.5) / n, (((q - n // 2) * step + n // 2) % n + 0.5) / n
-                            Q[:] = 0.0
-                            x_q, y_q = i + (b + x) * h, j + (a + y) * h
-                            sample(k, edges, planes, columns, P[6], x_q, y_q, Q)
-                            value, _ = _transmission(c, work, Q, L, u_0 + x_q, v_0 + y_q)
-                            least, most_I = min(least, value), max(most_I, value)
-                            m += value
-                            m_u += value * (x - 0.5)
-                            m_v += value * (y - 0.5)
-                            m_uv += value * (x - 0.5) * (y - 0.5)
-                        if level == 2 or most_I - least < STEEP[level]:
-                            # Slopes per px of the least-squares bilinear surface: 12 / h times the first moments.
-                            s = weight * 12 * f / n
-                            add(out, j * f + a, i * f + b, weight * m / n, s * m_u, s * m_v, s * 12 * f * m_uv)
-                            break
+                    M[:] = 0.0
+                    for q in range(n):
+                        x, y = points[q]
+                        Q[:] = 0.0
+                        x_q, y_q = i + (b + x + 0.5) * h, j + (a + y + 0.5) * h
+                        sample(k, edges, planes, columns, P[6], x_q, y_q, Q)
+                        value, _ = _transmission(c, work, Q, L, u_0 + x_q, v_0 + y_q)
+                        gather_value(M, value / n, x, y)
+                    add_moments(out, j * f + a, i * f + b, weight, f, M, xy, (1 - 1 / n**2) / 12)
 
 
 def add_mesh_transmission(
@@ -160,7 +181,7 @@ def add_mesh_transmission(
     in_bands(corners, n_v + 1, threads)
     if not fine[0]:
         raise InputError(f"a ray crosses more than {LARGEST} surfaces of one solid; split the solid in several")
-    in_bands(lambda lo, hi: fill_smooth(I, seen, f, lo, hi, weight, out, rough), n_v, threads)
+    in_bands(lambda lo, hi: fill_smooth(I, seen, SMOOTH, f, lo, hi, weight, out, rough), n_v, threads)
     count, start = np.zeros((n_v, n_u), dtype=np.int64), np.zeros((n_v, n_u), dtype=np.int64)
     nothing = np.empty(0, dtype=np.int64)
     in_bands(lambda lo, hi: touching(P, rough, lo, hi, count, start, nothing), n_v, threads)

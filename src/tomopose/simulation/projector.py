@@ -5,8 +5,7 @@ smooth, its mean follows from the corners (bilinear with the curvature's correct
 cut in f x f cells; a cell with a faint edge is sampled at the points of a Fibonacci lattice, which no straight edge
 can follow, and a cell with a steep edge is cut along it.
 The result has f x f cells a pixel, so that blur acts before the pixel integrates, as it does in a scintillator; and
-each cell holds four numbers (mean, slope along u, slope along v, twist: the bilinear surface nearest to the
-transmission), so that an edge keeps its place inside its cell.
+each cell holds the quadratic surface nearest to the transmission (`cells`), so that an edge keeps its place inside it.
 """
 
 from __future__ import annotations
@@ -19,20 +18,20 @@ from numba import njit
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.simulation.cells import HELD, LATTICE_5, LATTICE_13, add, add_moments, fill_smooth, gather_value
 from tomopose.simulation.rays import LARGEST, Compiled
 from tomopose.simulation.sampling import BLOCK, all_corners, at, coarse_corners, kernel_scene, work_space
-from tomopose.simulation.smooth import add, fill_smooth
 from tomopose.simulation.spectrum import Beam
 from tomopose.simulation.view import View, Window, in_bands
 from tomopose.units import Array
 
-LATTICES = ((5, 3), (13, 8))
-"""Fibonacci lattices (n, k) of a cell: points (i / n, k i / n mod 1), placed symmetrically about its middle."""
 FLAT = 2e-3
 """Differences of transmission over a cell below this need no lattice; above 6 times this the finer one; above 24 times
 an edge is cut exactly."""
 HALVINGS = 9
 GAUSS = np.stack([(np.polynomial.legendre.leggauss(4)[0] + 1) / 2, np.polynomial.legendre.leggauss(4)[1] / 2], axis=1)
+SMOOTH = 2e-4
+"""Largest third difference of transmission over the corners that counts as smooth."""
 SMALL_PX = 8.0
 """Where a primitive is thinner than this (half its side, px), every ray is cast."""
 
@@ -53,15 +52,15 @@ def _crossing(c: Any, work: Any, u_0: float, v_0: float, u_1: float, v_1: float,
 
 @njit(cache=True, nogil=True)
 def _split_cell(
-    c: Any, work: Any, left: float, low: float, h: float, along_u: bool, m_00: int, m_10: int, m_01: int, m_11: int
-) -> Any:
-    """Moments (m, m_u, m_v, m_uv about the middle, side 1) of a cell that a steep edge crosses.
+    c: Any, work: Any, left: float, low: float, h: float, along_u: bool, marks: Any, M: Any
+) -> None:
+    """Gather in M the moments of a cell that a steep edge crosses.
 
-    x runs across the edge (along u or v), y along it; m_xy: signatures of the corners.  The cell is cut at the y where
+    x runs across the edge (along u or v), y along it; marks: signatures of the corners, m_xy.  The cell is cut at the y where
     the edge leaves it sideways, if it does; on Gauss's lines in y the edge's place is found by halving, and both sides
     are integrated by Gauss's rule in the root of the distance from the edge, where a round rim is smooth.
     """
-    m = m_u = m_v = m_uv = 0.0
+    m_00, m_10, m_01, m_11 = marks
     u_x, v_x, u_y, v_y = (h, 0.0, 0.0, h) if along_u else (0.0, h, h, 0.0)
     cut = 1.0
     if (m_00 != m_10) != (m_01 != m_11):
@@ -74,21 +73,24 @@ def _split_cell(
         for q in range(len(GAUSS)):
             y = y_0 + (y_1 - y_0) * GAUSS[q, 0]
             u, v = left + y * u_y, low + y * v_y
-            _, mark = at(c, work, u, v)
-            _, other = at(c, work, u + u_x, v + v_x)
-            edge = _crossing(c, work, u, v, u + u_x, v + v_x, mark) if mark != other else 0.5
+            start, mark = at(c, work, u, v)
+            end, other = at(c, work, u + u_x, v + v_x)
+            if mark != other:
+                edge = _crossing(c, work, u, v, u + u_x, v + v_x, mark)
+            else:
+                # The edge lies just outside: integrate in the root of the distance from that end.
+                middle, _ = at(c, work, u + 0.5 * u_x, v + 0.5 * v_x)
+                edge = 0.0 if abs(start - middle) > abs(end - middle) else 1.0
             for side in range(2):
                 length = -edge if side == 0 else 1.0 - edge
+                if length == 0.0:
+                    continue
                 for g in range(len(GAUSS)):
                     x = edge + length * GAUSS[g, 0] ** 2
                     value, _ = at(c, work, u + x * u_x, v + x * v_x)
                     value *= 2 * GAUSS[g, 0] * GAUSS[g, 1] * abs(length) * GAUSS[q, 1] * (y_1 - y_0)
                     a, b = (x - 0.5, y - 0.5) if along_u else (y - 0.5, x - 0.5)
-                    m += value
-                    m_u += value * a
-                    m_v += value * b
-                    m_uv += value * a * b
-    return m, m_u, m_v, m_uv
+                    gather_value(M, value, a, b)
 
 
 @njit(cache=True, nogil=True)
@@ -106,11 +108,11 @@ def _cells(
     out: Any,
     rough: Any,
 ) -> None:
-    """Add weight x moments of the f x f cells of the pixels in rows j_0 to j_1 to `out` (4, rows, columns)."""
+    """Add weight x moments of the f x f cells of the pixels in rows j_0 to j_1 to `out` (HELD, rows, columns)."""
     work = work_space(c, depth)
     node, node_seen = np.empty((f + 1, f + 1)), np.empty((f + 1, f + 1), dtype=np.int64)
-    h = 1.0 / f
-    fill_smooth(I, seen, f, j_0, j_1, weight, out, rough)
+    h, M = 1.0 / f, np.empty(HELD)
+    fill_smooth(I, seen, SMOOTH, f, j_0, j_1, weight, out, rough)
     for j in range(j_0, j_1):
         for i in range(I.shape[1] - 1):
             if not rough[j, i]:
@@ -132,6 +134,7 @@ def _cells(
                     if same and mark == 0:
                         out[0, j * f + a, i * f + b] += weight
                         continue
+                    M[:] = 0.0
                     corners = (f_00 + f_01 + f_10 + f_11) / 4
                     middle, _ = at(c, work, left + (b + 0.5) * h, low + (a + 0.5) * h)
                     span = max(f_00, f_01, f_10, f_11, middle) - min(f_00, f_01, f_10, f_11, middle)
@@ -144,9 +147,11 @@ def _cells(
                             weight * f * (f_01 + f_11 - f_00 - f_10) / 2,
                             weight * f * (f_10 + f_11 - f_00 - f_01) / 2,
                             weight * f * f * (f_11 - f_10 - f_01 + f_00),
+                            0.0,
+                            0.0,
                         )
                         continue
-                    if not same and span > 24 * FLAT:
+                    if span > 24 * FLAT:
                         m_00, m_01 = node_seen[a, b], node_seen[a, b + 1]
                         m_10, m_11 = node_seen[a + 1, b], node_seen[a + 1, b + 1]
                         sides_u = int(m_00 != m_01) + int(m_10 != m_11)
@@ -154,29 +159,18 @@ def _cells(
                         along_u = abs(f_01 + f_11 - f_00 - f_10) > abs(f_10 + f_11 - f_00 - f_01)
                         if sides_u != sides_v:
                             along_u = sides_u > sides_v
-                        if along_u:
-                            m, m_u, m_v, m_uv = _split_cell(
-                                c, work, left + b * h, low + a * h, h, True, m_00, m_01, m_10, m_11
-                            )
-                        else:
-                            m, m_u, m_v, m_uv = _split_cell(
-                                c, work, left + b * h, low + a * h, h, False, m_00, m_10, m_01, m_11
-                            )
-                        k = weight * 12 * f
-                        add(out, j * f + a, i * f + b, weight * m, k * m_u, k * m_v, k * 12 * f * m_uv)
+                        marks = (m_00, m_01, m_10, m_11) if along_u else (m_00, m_10, m_01, m_11)
+                        _split_cell(c, work, left + b * h, low + a * h, h, along_u, marks, M)
+                        add_moments(out, j * f + a, i * f + b, weight, f, M, 0.0, 1 / 12)
                         continue
-                    n, step = LATTICES[1] if span > 6 * FLAT else LATTICES[0]
-                    m = m_u = m_v = m_uv = 0.0
+                    points = LATTICE_13 if span > 6 * FLAT else LATTICE_5
+                    n = len(points)
                     for q in range(n):
-                        x, y = (q + 0.5) / n, (((q - n // 2) * step + n // 2) % n + 0.5) / n
-                        value, _ = at(c, work, left + (b + x) * h, low + (a + y) * h)
-                        m += value
-                        m_u += value * (x - 0.5)
-                        m_v += value * (y - 0.5)
-                        m_uv += value * (x - 0.5) * (y - 0.5)
-                    # Slopes per pixel of the least-squares bilinear surface: 12 / h times the first moments.
-                    k = weight * 12 * f / n
-                    add(out, j * f + a, i * f + b, weight * m / n, k * m_u, k * m_v, k * 12 * f * m_uv)
+                        x, y = points[q]
+                        value, _ = at(c, work, left + (b + x + 0.5) * h, low + (a + y + 0.5) * h)
+                        gather_value(M, value / n, x, y)
+                    xy = (points[:, 0] * points[:, 1]).mean()
+                    add_moments(out, j * f + a, i * f + b, weight, f, M, xy, (1 - 1 / n**2) / 12)
 
 
 def _without_small_parts(compiled: Compiled, boxes: Array) -> bool:
@@ -198,9 +192,7 @@ def add_transmission(
     weight: float = 1.0,
     threads: int = 1,
 ) -> None:
-    """Add weight x transmission to `out` (4, n_v f, n_u f), the cells of the window's pixels.
-
-    out[0]: mean; out[1], out[2]: slopes along u and v, per px; out[3]: twist, per px^2; float32.
+    """Add weight x transmission to `out` (HELD, n_v f, n_u f), float32, the cells of the window's pixels.
 
     T_FW: each frame's transform to W.  Raises InputError where a ray crosses more surfaces than `LARGEST`.
     """

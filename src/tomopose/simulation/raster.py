@@ -23,6 +23,10 @@ from tomopose.simulation.view import View, Window, in_bands
 from tomopose.units import Array
 
 
+ROOM = 1e-6
+"""px; far more than an edge's place is rounded by."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Projected:
     """Meshes on the panel.
@@ -160,7 +164,7 @@ def touching(P: Any, wanted: Any, j_0: int, j_1: int, count: Any, start: Any, li
 
 @njit(cache=True, nogil=True)
 def gather(P: Any, triangles: Any, edges: Any, planes: Any, columns: Any) -> None:
-    """What `sample` needs of the listed triangles: edges (k, 3, 6), planes (k, 7), columns (k,)."""
+    """What `sample` needs of the listed triangles: edges (k, 3, 6), planes (k, 11), columns (k,)."""
     x, y, h, faces, column, _, _ = P
     for k in range(len(triangles)):
         t = triangles[k]
@@ -170,13 +174,18 @@ def gather(P: Any, triangles: Any, edges: Any, planes: Any, columns: Any) -> Non
         edges[k, 1, :] = _edge(x, y, b, c)
         edges[k, 2, :] = _edge(x, y, c, a)
         h_a, h_x, h_y, least, most = _plane(x, y, h, a, b, c)
-        planes[k, :] = (x[a], y[a], h_a, h_x, h_y, least, most)
+        planes[k, :7] = (x[a], y[a], h_a, h_x, h_y, least, most)
+        planes[k, 7:9] = min(x[a], x[b], x[c]), max(x[a], x[b], x[c])
+        planes[k, 9:] = min(y[a], y[b], y[c]), max(y[a], y[b], y[c])
 
 
 @njit(cache=True, nogil=True)
 def sample(n: int, edges: Any, planes: Any, columns: Any, sign: float, x: float, y: float, Q: Any) -> None:
     """Add the signed q of n gathered triangles at (x, y) to Q (m,)."""
     for k in range(n):
+        # x on an edge is rounded: the box leaves room for it.
+        if not (planes[k, 9] <= y < planes[k, 10] and planes[k, 7] - ROOM <= x <= planes[k, 8] + ROOM):
+            continue
         way = 0.0
         for e in range(3):
             if edges[k, e, 0] <= y < edges[k, e, 1]:

@@ -18,6 +18,7 @@ from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.simulation.ball import ball_in_holder, ball_positions, silhouette_centre
 from tomopose.simulation.blur import margin, to_pixels
+from tomopose.simulation.cells import HELD
 from tomopose.simulation.detector import Detector, expose
 from tomopose.simulation.effects import with_glare, with_mtf, with_scatter
 from tomopose.simulation.gvxr import add_gvxr_transmission
@@ -167,7 +168,7 @@ def transmission(run: SimulatedRun, i: int, *, threads: int = 1) -> Array:
     if window is None:
         return out
     f = detector.cells
-    cells = np.zeros((4, window.n_v * f, window.n_u * f), dtype=np.float32)
+    cells = np.zeros((HELD, window.n_v * f, window.n_u * f), dtype=np.float32)
     for view, T_FW in views:
         share: dict[str, Any] = {"f": f, "weight": 1 / len(views), "threads": threads}
         if run.engine == "gvxr":
