@@ -9,10 +9,16 @@ import numpy as np
 
 from tomopose import BallObservations, Calibration, Frame, PoseSequence, RigidTransform, Scanner
 from tomopose.calibration.apply import projection_matrices
-from tomopose.calibration.kinematic_trajectory import object_points, rms_px, trajectory_sigma, without_object_pose
+from tomopose.calibration.kinematic_trajectory import (
+    object_points,
+    point_jacobian,
+    rms_px,
+    trajectory_sigma,
+    without_object_pose,
+)
 from tomopose.calibration.solve import calibrate
 from tomopose.geometry.projection import eq5_matrices, project_ball
-from tomopose.geometry.rotations import R_y, R_z
+from tomopose.geometry.rotations import R_x, R_y, R_z
 from tomopose.manipulator.real_poses import Repeatability
 from tomopose.manipulator.serial import poses_from_joints
 from tomopose.manipulator.virtual import Disturbance, real_motion
@@ -23,7 +29,11 @@ SCANNER = Scanner(
 """Magnification 5.3 of the paper."""
 DETECTION_PX = 0.0207
 """rms distance of detected centres from the true ones, table 1: both coordinates together."""
-ROBOT_BALLS = np.array([[20.0, -15.0, 60.0], [-22.0, 10.0, 20.0]])
+ROBOT_OBJECT = np.array([0.0, 0.0, 60.0])
+ROBOT_BALLS = ROBOT_OBJECT + np.array([[12.0, -14.0, 10.0], [-10.0, 12.0, -15.0]])
+X_WORK, R_WORK = np.array([480.0, 30.0, 300.0]), np.diag([1.0, -1.0, -1.0])
+"""Where a robot holds the middle of the object, in its base, mm, flange downwards."""
+Q_WORK = np.radians([5.0, 30.0, 20.0, 0.0, 40.0, 0.0])
 UM_PER_PX = 200.0 / SCANNER.magnification
 
 
@@ -138,44 +148,55 @@ def hexapod_experiment(
     )
 
 
-def robot_experiment(robot: Any, seed: int, *, n: int = 200, balls: int = 1, table: bool = False) -> Experiment:
-    """The object on a robot's flange: n poses around the working one, then a tilted turn of 330 deg.
+def robot_plan(
+    robot: Any, rng: np.random.Generator, *, n: int, balls: int, spin: float, tilt: float, shift: float, table: bool
+) -> PoseSequence:
+    """n poses about the middle of the object: any spin and tilt (rad) and shift (mm) up to these."""
+    R = R_WORK @ R_z(rng.uniform(-spin, spin, n)) @ R_y(rng.uniform(-tilt, tilt, n)) @ R_x(rng.uniform(-tilt, tilt, n))
+    t = X_WORK + rng.uniform(-shift, shift, (n, 3)) - R @ ROBOT_OBJECT
+    q = robot.inverse(RigidTransform(R=R, t=t, source=Frame.M, target=Frame.H), q_start=Q_WORK)
+    alpha = np.radians(90.0 * (np.arange(n) * 4 // n)) if table else np.zeros(n)
+    return poses_from_joints(robot, q, ball_id=np.arange(n) % balls, alpha=alpha)
+
+
+def robot_scan(robot: Any, *, n: int = 180, tilt: float = float(np.radians(8))) -> PoseSequence:
+    """A turn of 332 deg by the robot itself, the table still, tilted by tilt * sin(7 angle)."""
+    angle = np.linspace(-2.9, 2.9, n)
+    R = R_WORK @ R_z(angle) @ R_y(tilt * np.sin(7 * angle))
+    T = RigidTransform(R=R, t=X_WORK - R @ ROBOT_OBJECT, source=Frame.M, target=Frame.H)
+    return poses_from_joints(robot, robot.inverse(T, q_start=Q_WORK))
+
+
+def robot_experiment(
+    robot: Any, seed: int, *, n: int = 200, balls: int = 1, table: bool = False, spin: float = 2.9,
+    tilt_deg: float = 20.0, shift: float = 10.0,
+) -> Experiment:
+    """The object hangs on a robot's flange before the source: n poses about its middle, then a tilted turn.
 
     table: the robot stands on the rotary table, which takes four angles.
     """
     rng = np.random.default_rng(np.random.SeedSequence([6, seed]))
     p = rng.standard_normal(len(robot.names)) * robot.sigma
-    centre = robot.forward(robot.q_start[None])
-    # the working point lies at the W origin
-    T_HT = RigidTransform.from_angles([0.01, -0.02, np.pi], np.zeros(3), source=Frame.H, target=Frame.T)
-    T_HT = replace(T_HT, t=-(T_HT.R @ centre.t[0]))
-    t = ROBOT_BALLS[:balls]
-    q = robot.inverse(
-        RigidTransform(
-            R=centre.R[0] @ R_z(rng.uniform(-2.9, 2.9, n)) @ R_y(np.radians(rng.uniform(-20, 20, n))),
-            t=centre.t[0] + rng.uniform(-12, 12, (n, 3)), source=Frame.M, target=Frame.H,
-        )
+    # the base stands behind the source; the middle of the object lies at the W origin
+    T_HT = RigidTransform.from_angles([0.01, -0.02, np.pi - 0.3], np.zeros(3), source=Frame.H, target=Frame.T)
+    T_HT = replace(T_HT, t=-(T_HT.R @ X_WORK))
+    poses = robot_plan(
+        robot, rng, n=n, balls=balls, spin=spin, tilt=float(np.radians(tilt_deg)), shift=shift, table=table
     )
-    alpha = np.radians(90.0 * (np.arange(n) * 4 // n)) if table else np.zeros(n)
-    poses = poses_from_joints(robot, q, ball_id=np.arange(n) % balls, alpha=alpha)
-    angle = np.linspace(-2.9, 2.9, 180)
-    q_scan = robot.inverse(
-        RigidTransform(
-            R=centre.R[0] @ R_z(angle) @ R_y(np.radians(8) * np.sin(7 * angle)), t=np.tile(centre.t, (180, 1)),
-            source=Frame.M, target=Frame.H,
-        )
+    return experiment(
+        robot, p, poses, robot_scan(robot), T_HT=T_HT, balls=ROBOT_BALLS[:balls], rng=rng, centre=ROBOT_OBJECT
     )
-    scan = poses_from_joints(robot, q_scan)
-    return experiment(robot, p, poses, scan, T_HT=T_HT, balls=t, rng=rng, centre=(0.0, 0.0, 40.0))
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScanError:
     """px, rms over views and points of the distance, the object's rigid pose removed: error of the matrices (that all
-    views share) and what is stated for it; error of the single views as executed and what is stated for them.
+    views share), what is left of it beside the scale of the object, and what is stated for it; error of the single
+    views as executed and what is stated for them.
     inside: share of the single views' coordinates that 95 % of the stated uncertainty covers."""
 
     shared: float
+    but_scale: float
     u_shared: float
     single: float
     u_single: float
@@ -186,8 +207,10 @@ def scan_error(calibration: Calibration, e: Experiment) -> ScanError:
     P = projection_matrices(calibration, e.scan).P
     d, d_single = (without_object_pose(P, true, e.points) for true in (e.P_true, e.P_executed))
     u, u_single = (trajectory_sigma(calibration, e.scan, e.points, scatter=s) for s in (False, True))
+    grow = np.einsum("nmij,mj->nmi", point_jacobian(e.P_true, e.points), e.points - e.points.mean(axis=0))
     return ScanError(
-        shared=rms_px(d), u_shared=rms_px(u), single=rms_px(d_single), u_single=rms_px(u_single),
+        shared=rms_px(d), but_scale=rms_px(d - grow * np.sum(grow * d) / np.sum(grow**2)), u_shared=rms_px(u),
+        single=rms_px(d_single), u_single=rms_px(u_single),
         inside=float(np.mean(np.abs(d_single) < 1.96 * u_single)),
     )
 

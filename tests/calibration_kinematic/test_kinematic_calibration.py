@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from manipulator_cases import (
     ROBOT_BALLS,
+    SCANNER,
     Experiment,
     hexapod_experiment,
     robot_experiment,
@@ -18,7 +19,9 @@ from manipulator_cases import (
 from tomopose import BallObservations, Calibration
 from tomopose.calibration.apply import projection_matrices
 from tomopose.calibration.kinematic import calibrate_kinematic, machine_of
-from tomopose.calibration.kinematic_trajectory import rms_px, without_object_pose
+from tomopose.calibration.kinematic_design import plan_kinematic
+from tomopose.calibration.kinematic_robot import robot_work
+from tomopose.calibration.kinematic_trajectory import object_points, rms_px, without_object_pose
 from tomopose.calibration.model_choice import EVIDENCE_GAIN
 from tomopose.calibration.solve import calibrate
 from tomopose.errors import InputError
@@ -130,6 +133,38 @@ def test_robot_on_the_table() -> None:
     assert scan_error(found(e), e).shared < scan_error(rigid_of(e), e).shared / 20
 
 
+def test_scale_of_a_robot_alone_is_as_good_as_its_links() -> None:
+    """With one ball and the table still, what is left is the scale of the object, whatever the poses; it is told."""
+    e = robot_experiment(ROBOT, 1)
+    cal = found(e)
+    error, before = scan_error(cal, e), scan_error(rigid_of(e), e).shared
+    assert error.but_scale < before / 50
+    assert 0.2 < error.u_shared < 0.5
+    assert error.shared < 2.5 * error.u_shared
+    assert any("all lengths of the robot together" in note for note in cal.observability.notes)
+    table = found(robot_experiment(ROBOT, 1, table=True))
+    assert not any("all lengths" in note for note in table.observability.notes)
+
+
+def test_planned_poses_of_a_robot() -> None:
+    """With table angles the plan determines the scale; without, it says what it leaves."""
+    still, turned = (
+        plan_kinematic(
+            SCANNER, ROBOT, T_HT=work.T_HT, balls=[10.0, -8.0, 16.0], candidates=work.candidates, scan=work.scan,
+            points=object_points(), n=40,
+        )
+        for work in (
+            robot_work(ROBOT, half_range=10.0, tilt=0.35, spin=2.9, table_angles=angles)
+            for angles in ((0.0,), (0.0, np.pi / 2, np.pi))
+        )
+    )
+    assert still.trusted > 20 * still.but_scale
+    assert still.identified > 10 * still.but_scale
+    assert turned.identified < 0.01
+    assert turned.poses.q is not None
+    np.testing.assert_allclose(ROBOT.forward(turned.poses.q).t, turned.poses.T_MH.t, atol=1e-9)
+
+
 def test_robot_alone_needs_one_known_length() -> None:
     """All of a robot's lengths with the ball and the distance to the source can grow together; a scale bar stops it."""
     e = robot_experiment(ROBOT, 1, balls=2)
@@ -159,7 +194,7 @@ def test_matrices_of_a_robot_whose_base_is_behind_the_source() -> None:
 
 
 def test_cartesian_log_of_a_robot_gives_the_same() -> None:
-    e = robot_experiment(ROBOT, 0, n=60, table=True)
+    e = robot_experiment(ROBOT, 0, n=60, table=True, spin=1.0, tilt_deg=8.0)  # one branch of the wrist throughout
     cartesian = replace(e.poses, q=None)
     a, b = found(e, "kinematic"), found(e, "kinematic", poses=cartesian)
     np.testing.assert_allclose(a.manipulator["values"], b.manipulator["values"], atol=1e-6)

@@ -33,12 +33,13 @@ MARGIN_PX = 20.0
 @dataclass(frozen=True, kw_only=True)
 class KinematicPlan:
     """poses: the chosen ones, in the candidates' order.  Predicted rms of the scan's error at the object's points, px:
-    trusted: if the poses are calibrated and then trusted; identified: if the errors are identified from them; history:
-    the latter after each chosen pose (n,)."""
+    trusted: if the poses are calibrated and then trusted; identified: if the errors are identified from them;
+    but_scale: what is left of it beside the scale of the object; history: `identified` after each chosen pose (n,)."""
 
     poses: PoseSequence
     trusted: float
     identified: float
+    but_scale: float
     history: Array
 
 
@@ -89,10 +90,13 @@ def plan_kinematic(
         Sigma = (Sigma + Sigma.T) / 2
         history.append(float(np.sqrt(max(np.sum(B * Sigma), 0.0) / count)))
     rows = np.sort(chosen)
+    scale = scale_direction(scanner, T_HT, machine, scan, np.asarray(points, dtype=np.float64))
+    along: Array = scale @ J_scan
     return KinematicPlan(
         poses=candidates.select(rows),
         trusted=trusted_error(J[rows], J_scan, machine.sigma),
         identified=history[-1],
+        but_scale=float(np.sqrt(max(history[-1] ** 2 - float(along @ Sigma @ along) / count, 0.0))),
         history=np.array(history),
     )
 
@@ -118,17 +122,36 @@ def scan_jacobian(
     """
     real = machine.real_poses(scan, np.zeros(len(machine.names)))
     J = np.zeros((len(points), len(scan), 2, m))
-    rigid_pose = np.zeros((len(points), len(scan), 2, 6))
     for i, x_M in enumerate(points):
         b = projection_blocks(scanner, T_HT=T_HT, T_MH=real.T_MH, t=x_M, alpha=scan.alpha)
         J_pose = np.concatenate([-b.G_H @ skew(b.x_H - real.t), b.G_H], axis=2)
         J[i, :, :, :6] = b.J_mount
         J[i, :, :, m - len(machine.names) :] = J_pose @ real.J
-        rigid_pose[i] = np.concatenate([-b.J_t @ skew(x_M), b.J_t], axis=2)
-    G = rigid_pose.reshape(-1, 6)
-    Q, _ = np.linalg.qr(G / np.linalg.norm(G, axis=0))
+    Q = _object_moves(scanner, T_HT, machine, scan, points)[:, :6]
     flat = J.reshape(-1, m)
     return np.asarray(flat - Q @ (Q.T @ flat))
+
+
+def scale_direction(
+    scanner: Scanner, T_HT: RigidTransform, machine: ErrorModel, scan: PoseSequence, points: Array
+) -> Array:
+    """(rows,) unit vector: how the scan's pixels answer to the scale of the object, its rigid pose removed."""
+    return _object_moves(scanner, T_HT, machine, scan, points)[:, 6]
+
+
+def _object_moves(
+    scanner: Scanner, T_HT: RigidTransform, machine: ErrorModel, scan: PoseSequence, points: Array
+) -> Array:
+    """(rows, 7) orthonormal: the pixels' answers to the rigid pose (6) and then to the scale of the object."""
+    real = machine.real_poses(scan, np.zeros(len(machine.names)))
+    parts = []
+    for x_M in points:
+        b = projection_blocks(scanner, T_HT=T_HT, T_MH=real.T_MH, t=x_M, alpha=scan.alpha)
+        grow = b.J_t @ (x_M - points.mean(axis=0))[:, None]
+        parts.append(np.concatenate([-b.J_t @ skew(x_M), b.J_t, grow], axis=2))
+    G = np.stack(parts).reshape(-1, 7)
+    Q, _ = np.linalg.qr(G / np.linalg.norm(G, axis=0))
+    return np.asarray(Q)
 
 
 def _virtual(

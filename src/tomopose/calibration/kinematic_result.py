@@ -17,15 +17,21 @@ from tomopose.calibration.slack import determined_turns
 from tomopose.calibration.uncertainty import WIDENING_PROBABILITY, angles_by_tangent
 from tomopose.geometry.rotations import angles_from_rotation
 from tomopose.manipulator.error_models import manipulator_block
+from tomopose.manipulator.inverse import InverseManipulator
+from tomopose.manipulator.real_poses import ErrorModel
 from tomopose.manipulator.run_effects import WithRunEffects
+from tomopose.manipulator.serial import SerialRobot
 from tomopose.provenance import provenance
+from tomopose.units import Array
 
 RUN_EFFECTS_FOUND = (
     "during the run the manipulator drifted or its drives lagged (drift and lag are among the parameters): matrices "
     "apply the lag in the order of the scan's table, and count the drift, which a scan may show again, as scatter"
 )
-NOTABLE_SCATTER, LARGE_SCATTER = 1.5, 9.0
-"""Times the stated variance: a scatter that is no chance; one that means an error which no model here holds."""
+LARGE_SCATTER = 9.0
+"""Times the stated variance: a scatter that means an error which no model here holds."""
+KNOWN_SCALE = 0.5
+"""Share of its prior variance above which the common scale of a robot's links counts as not measured."""
 
 
 def comparison(
@@ -44,9 +50,10 @@ def comparison(
 
 def _parameters(fit: ModelFit) -> tuple[Parameter, ...]:
     e, free = fit.estimate, fit.estimate.problem.free
-    u = np.sqrt(np.diag(e.covariance))
+    C = e.covariance
+    u = np.sqrt(np.diag(C))
     E = angles_by_tangent(e.state.T_HT.R)
-    u_angles = np.sqrt(np.einsum("ij,jk,ik->i", E, e.covariance[:3, :3], E))
+    u_angles = np.sqrt(np.einsum("ij,jk,ik->i", E, C[:3, :3], E))
     result = [
         Parameter(name=f"phi_HT_{c}", value=float(a), u=float(s), unit="rad")
         for c, a, s in zip("xyz", angles_from_rotation(e.state.T_HT.R), u_angles, strict=True)
@@ -101,6 +108,7 @@ def calibration_of(
             f"the radiographs determine {gamma:.1f} of {m} errors of the manipulator; the others, and shifts and turns "
             "of whole plates, which the mount and the ball take up, stay at their priors"
         )
+        notes += _scale_note(model, e.covariance[before : before + m, before : before + m])
     block["scatter"] = scatter_block(fit)
     reasons = [*doubts, *_doubts(fit, judged, chosen)]
     if asked == "slack":
@@ -145,6 +153,27 @@ def calibration_of(
             arguments={**({} if rigid.provenance is None else dict(rigid.provenance.arguments)), "model": asked}
         ),
     )
+
+
+def _scale_note(model: ErrorModel, covariance: Array) -> list[str]:
+    """The sentence where a robot's links tell the scale of everything, and no measurement does.
+
+    The common factor s of all lengths l_i with priors sigma_i is estimated by sum(l_i p_i / sigma_i^2) / sum(l_i^2 /
+    sigma_i^2), with the prior variance 1 / sum(l_i^2 / sigma_i^2); a variance hardly below that is no measurement.
+    """
+    robot = model.machine if isinstance(model, InverseManipulator) else model
+    if not isinstance(robot, SerialRobot):
+        return []
+    length = robot.lengths / robot.sigma**2
+    prior = 1 / max(float(robot.lengths @ length), 1e-30)
+    found = prior * float(length @ covariance @ length) * prior
+    if found < KNOWN_SCALE * prior:
+        return []
+    return [
+        f"all lengths of the robot together, the ball's offset and the distance to the source are known to "
+        f"{np.sqrt(found):.1e} only, from the tolerances of its links: the scale of the scan is as uncertain, whatever "
+        "the poses; use table angles or a known distance between two balls"
+    ]
 
 
 def _doubts(fit: ModelFit, judged: Mapping[str, Judgement], chosen: str) -> Iterator[str]:

@@ -15,8 +15,9 @@ from tomopose.manipulator.pose_map import PoseMap
 from tomopose.units import Array
 
 LEVER_RANGE_MM = (75.0, 300.0)
-"""How far from the plate's origin the joints lie that cause its errors, by a logarithmic prior from a plate's edge to its
-far joints: what turns a size in mm into one in rad where the data do not tell it.  What is stated away from the ball follows from it."""
+"""How far from the plate's origin the joints lie that cause its errors, by a logarithmic prior from a plate's edge to
+its far joints: what turns a size in mm into one in rad where the data do not tell it.  What is stated away from the
+ball follows from it."""
 SMALLEST_ERROR_MM = 1e-4
 UNDETERMINED_SHARE = 0.25
 """Share of the prior variance of the plate's turns that may be left before they count as not determined."""

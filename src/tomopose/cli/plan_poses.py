@@ -61,9 +61,9 @@ def plan_limits(*, half_range: float, tilt: float, table_angles: tuple[float, ..
 
 def kinematic_poses(
     scanner: Scanner, machine: Any, *, half_range: float, tilt: float, table_angles: tuple[float, ...],
-    ball_diameter: float, images: int,
+    ball_diameter: float, images: int, spin: float,
 ) -> Any:
-    """The plan that determines what a tilted scan needs of the manipulator's own errors."""
+    """The plan that determines what a tilted scan needs of the manipulator's own errors; angles in degrees."""
     import numpy as np
 
     from tomopose.calibration.kinematic_design import plan_kinematic
@@ -72,9 +72,20 @@ def kinematic_poses(
     from tomopose.planning.limits import candidates
     from tomopose.planning.target import default_scan
 
+    ball = np.array(BALL_MM)
+    if hasattr(machine, "joints"):
+        from tomopose.calibration.kinematic_robot import robot_work
+
+        work = robot_work(
+            machine, half_range=half_range, tilt=math.radians(tilt), spin=math.radians(spin),
+            table_angles=tuple(math.radians(a) for a in table_angles),
+        )
+        return plan_kinematic(
+            scanner, machine, T_HT=work.T_HT, balls=ball, candidates=work.candidates, scan=work.scan,
+            points=object_points(), n=images,
+        )
     limits = plan_limits(half_range=half_range, tilt=tilt, table_angles=table_angles, ball_diameter=ball_diameter)
     mount = nominal_mount()
-    ball = np.array(BALL_MM)
     return plan_kinematic(
         scanner, machine, T_HT=mount, balls=ball, candidates=candidates(scanner, T_HT=mount, t=ball, limits=limits),
         scan=default_scan(mount), points=object_points(), n=images,
@@ -112,6 +123,9 @@ def poses(
     ] = None,
     half_range: Annotated[float, typer.Option("--half-range-mm", help="How far the positions reach, mm.")] = 10.0,
     tilt: Annotated[float, typer.Option("--tilt-deg", help="Largest rotation about each axis, degrees.")] = 5.0,
+    spin: Annotated[
+        float, typer.Option("--spin-deg", help="With --for kinematic: a robot's largest turn about its tool's z, deg.")
+    ] = 165.0,
     table_angles: Annotated[
         str, typer.Option("--table-angles-deg", help="Table angles to use; 0,90 shows what 0 alone cannot.")
     ] = "0",
@@ -154,13 +168,19 @@ def poses(
             if manipulator is None:
                 raise typer.BadParameter("its nominal geometry is needed", param_hint="--manipulator")
             machine = tp.read_manipulator(manipulator)
-            found = kinematic_poses(geometry, machine, images=images or KINEMATIC_IMAGES, **given)
+            found = kinematic_poses(geometry, machine, images=images or KINEMATIC_IMAGES, spin=spin, **given)
             sequence = found.poses
-            summary |= {"trusted_px": found.trusted, "identified_px": found.identified}
+            summary |= {"trusted_px": found.trusted, "identified_px": found.identified,
+                        "identified_but_scale_px": found.but_scale}
             lines.append(
                 f"  predicted scan error: {found.trusted:.3g} px if the poses are trusted, {found.identified:.3g} px "
                 "with the manipulator's errors identified from these images"
             )
+            if found.but_scale < 0.5 * found.identified:
+                lines.append(
+                    f"  most of it is the scale of the object; without it {found.but_scale:.3g} px. More table angles "
+                    "or a known distance between two balls determine the scale"
+                )
         elif purpose == "rigid":
             plan = best_poses(geometry, images=images, goal=goal, **given)
             sequence = plan.poses

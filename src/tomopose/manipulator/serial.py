@@ -120,6 +120,11 @@ class SerialRobot:
     def sigma(self) -> Array:
         return np.array([sigma for _, _, sigma in self._errors])
 
+    @property
+    def lengths(self) -> Array:
+        """(len(p),) mm: the nominal length that each error changes; 0 where it changes an angle."""
+        return np.array([getattr(self.joints[k], name) if name in ("a", "d") else 0.0 for k, name, _ in self._errors])
+
     # -- kinematics --------------------------------------------------------------------------------------------------
 
     def chain(self, q: Array, p: Array | None = None) -> tuple[Array, Array, Array]:
