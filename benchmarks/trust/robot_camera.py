@@ -12,11 +12,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtri
 
 from tomopose.calibration.estimate import best_fit
-from tomopose.calibration.fit import Fit, blocks
+from tomopose.calibration.fit import Fit, blocks, jacobian
 from tomopose.calibration.parameters import free_parameters
-from tomopose.calibration.pose_field import PoseField, estimate_pose_field, solve_with_field
+from tomopose.calibration.pose_field import (
+    PoseField,
+    estimate_pose_field,
+    field_covariance,
+    field_shares,
+    lever_blocks,
+    solve_with_field,
+)
 from tomopose.calibration.problem import Problem, pair
 from tomopose.calibration.uncertainty import inverse_information
 from tomopose.geometry.frames import Frame
@@ -29,12 +37,10 @@ from tomopose.observations import BallObservations
 CORNER_SIGMA_PX = 0.1
 """The camera calibration's own residual (camera_calib_rms_px in the file)."""
 
-INTRINSIC_SIGMA_PX = 1.0
-"""How well focal length and piercing point of the camera are taken to be known; the file does not say."""
-
 D_SD_MM = 1000.0
-FIELD_LENGTH_MM = 200.0
 UNDISTORTIONS = 50
+TOGETHER = 12
+"""Corners, evenly spread, from which the robot's errors are estimated; more do not change them and take long."""
 
 
 def undistorted(uv: Any, K: Any, k: Any) -> np.ndarray:
@@ -76,6 +82,12 @@ def corner_problems(folder: Path, corners: Any) -> list[Problem]:
     ]
 
 
+def _median_ratio(d: np.ndarray, C: np.ndarray) -> float:
+    """Median of the normalised distances of d (n, c) over that of chi2 with c degrees of freedom, as a root."""
+    q = np.einsum("ni,ni->n", d, np.linalg.solve(C, d[:, :, None])[..., 0])
+    return float(np.sqrt(np.median(q) / chdtri(d.shape[1], 0.5)))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Spread:
     """Robust normalised spread of mounts about their median: 1 where the stated covariances are right."""
@@ -94,18 +106,56 @@ def normalised_spread(fits: list[Fit], covariances: list[np.ndarray]) -> Spread:
     w = log_rotation(R @ centre.T)
     e = np.concatenate([w, t - np.median(t, axis=0)], axis=1)
 
-    def median_of(d: np.ndarray, C: np.ndarray, chi2_median: float) -> float:
-        q = np.einsum("ni,ni->n", d, np.linalg.solve(C, d[:, :, None])[..., 0])
-        return float(np.sqrt(np.median(q) / chi2_median))
-
     return Spread(
-        rotation=median_of(w, C[:, :3, :3], 2.366), mount=median_of(e, C[:, :6, :6], 5.348),
+        rotation=_median_ratio(w, C[:, :3, :3]), mount=_median_ratio(e, C[:, :6, :6]),
         rotation_rms_urad=float(1e6 * np.sqrt((w**2).sum(axis=1).mean())),
     )
 
 
-def study(folder: Path, corners: Any = range(3, 408, 17)) -> dict[str, Any]:
-    """Normalised spread with J^T J (scaled to the residuals), and with pose noise modelled."""
+def together(problems: list[Problem]) -> Problem:
+    """The corners as balls of one calibration, seen in the same images."""
+    rows = {
+        name: np.concatenate([getattr(p, name) for p in problems])
+        for name in ("R_MH", "t_MH", "alpha", "run", "index", "x_D", "covariance", "W")
+    }
+    return replace(
+        problems[0], **rows, ball=np.repeat(np.arange(len(problems)), [len(p) for p in problems]),
+        ball_ids=tuple(range(len(problems))),
+        pose_id=tuple(f"{i}/{c}" for c, p in enumerate(problems) for i in p.pose_id),
+    )
+
+
+def by_chance(problems: list[Problem], free: Any, fits: list[Fit], field: PoseField, draws: int = 400) -> np.ndarray:
+    """(draws, 2): the two normalised spreads where the model is the truth, to first order: every draw has one error a
+    pose, which all corners share."""
+    n, rng = len(problems[0]), np.random.default_rng(0)
+    shares = field_shares(problems[0], field)
+    roots = [np.linalg.cholesky(share + 1e-12 * np.trace(share) * np.eye(n)) for share in shares]
+    parts, covariances = [], []
+    for p, f in zip(problems, fits, strict=True):
+        b = blocks(p, free, f)
+        G, L, _ = lever_blocks(b, p.t_MH, field.base)
+        J = jacobian(p, free, b).reshape(2 * n, -1)
+        Vi = np.linalg.inv(field_covariance(p, free, f, field))
+        C = inverse_information(J.T @ Vi @ J)
+        parts.append((G, L, (C @ J.T @ Vi)[:6]))
+        covariances.append(C[:6, :6])
+    C6 = np.array(covariances)
+    spreads = []
+    for _ in range(draws):
+        e_t, e_w = (root @ rng.standard_normal((n, 3)) for root in roots)
+        e = np.array([
+            A @ (np.einsum("kij,kj->ki", G, e_t) + np.einsum("kij,kj->ki", L, e_w)
+                 + rng.normal(0, CORNER_SIGMA_PX, (n, 2))).ravel()
+            for G, L, A in parts
+        ])
+        e = e - np.median(e, axis=0)
+        spreads.append((_median_ratio(e[:, :3], C6[:, :3, :3]), _median_ratio(e, C6)))
+    return np.array(spreads)
+
+
+def study(folder: Path, corners: Any = range(408), *, joined: int = TOGETHER, chance: bool = True) -> dict[str, Any]:
+    """Normalised spread with J^T J (scaled to the residuals), and with the robot's errors modelled."""
     problems = corner_problems(folder, corners)
     free = free_parameters(problems[0].scanners)
     fits = [best_fit(p, free) for p in problems]
@@ -113,27 +163,26 @@ def study(folder: Path, corners: Any = range(3, 408, 17)) -> dict[str, Any]:
     plain = [inverse_information(f.N) * f.chi2 / dof for f in fits]
     residual = [float(np.sqrt(((p.x_D - blocks(p, free, f).x_D) ** 2).sum(axis=1).mean()))
                 for p, f in zip(problems, fits, strict=True)]
-    field = estimate_pose_field(problems, free, fits, length=FIELD_LENGTH_MM, base="M")
-    camera = problems[0].scanner
-    priors = {"d_SD": INTRINSIC_SIGMA_PX * camera.p_u, "u_0": INTRINSIC_SIGMA_PX, "v_0": INTRINSIC_SIGMA_PX}
-    modelled = {}
-    for name, freed in (("poses", free), ("poses and camera", free_parameters((camera,), priors=priors))):
-        solved = [
-            solve_with_field(p, freed, replace(f, delta=np.zeros(len(freed))), field)
-            for p, f in zip(problems, fits, strict=True)
-        ]
-        modelled[name] = normalised_spread([f for f, _ in solved], [C for _, C in solved])
+    run = together([problems[int(k)] for k in (np.arange(joined) + 0.5) * len(problems) / joined])
+    field = estimate_pose_field([run], free, [best_fit(run, free)], length=None, angle=None, base="M")
+    solved = [solve_with_field(p, free, f, field) for p, f in zip(problems, fits, strict=True)]
     return {
         "corners": len(problems),
         "residual_px": float(np.median(residual)),
         "field": field,
         "plain": normalised_spread(fits, plain),
-        "modelled": modelled,
+        "modelled": normalised_spread([f for f, _ in solved], [C for _, C in solved]),
+        "chance": np.quantile(by_chance(problems, free, [f for f, _ in solved], field), [0.025, 0.5, 0.975], axis=0)
+        if chance else None,
     }
 
 
 def described(field: PoseField) -> str:
-    return (
-        f"single poses {1e3 * field.translation:.0f} um and {1e6 * field.rotation:.0f} urad; shared over "
-        f"{field.length:.0f} mm {1e3 * field.field_translation:.0f} um and {1e6 * field.field_rotation:.0f} urad"
-    )
+    """The field by what it makes of a way of 100 mm and a turn of 20 degrees: the standard deviation of the change."""
+    way, turn = (np.sqrt(2 * (1 - np.exp(-x))) for x in (100.0 / field.length, np.radians(20.0) / field.angle))
+    parts = {
+        "single poses": (field.translation, field.rotation),
+        "change over 100 mm": (way * field.field_translation, way * field.field_rotation),
+        "change over 20 degrees": (turn * field.field_translation, turn * field.field_rotation),
+    }
+    return "; ".join(f"{words} {1e3 * t:.0f} um and {1e6 * w:.0f} urad" for words, (t, w) in parts.items())

@@ -23,11 +23,11 @@ def study():
 
 
 def test_spread_of_mounts_agrees_with_the_stated_uncertainty(study, shared_data):
-    found = study.study(shared_data / "robot-camera-kuka", range(3, 408, 17))
+    found = study.study(shared_data / "robot-camera-kuka", range(5, 408, 6), joined=5, chance=False)
     assert found["residual_px"] == pytest.approx(0.8, abs=0.1)
     # J^T J takes the robot's errors as independent: too small
     assert found["plain"].rotation > 1.4
-    modelled = found["modelled"]["poses and camera"]
-    assert 0.8 <= modelled.rotation <= 1.25
-    assert 0.8 <= modelled.mount <= 1.25
-    assert 0.8 <= found["modelled"]["poses"].rotation <= 1.25
+    assert found["plain"].mount > 1.4
+    # all corners share the errors of 28 poses: within what chance allows, and no longer too small
+    assert 0.8 <= found["modelled"].rotation <= 1.25
+    assert 0.6 <= found["modelled"].mount <= 1.25
