@@ -63,13 +63,43 @@ def test_history_grows_and_its_chart_finds_the_odd_run(tmp_path):
     quiet = control_chart([e for e in entries if e["label"] != "run 6"], "t_HT_y")
     assert not quiet.out.any()
     assert quiet.centre == pytest.approx(MOUNT.t[1], abs=0.002)
-    assert control_chart(entries, "t_HT_y").scatter > 0.005
+    full = control_chart(entries, "t_HT_y")
+    assert full.out.tolist() == [k == 6 for k in range(8)]
+    assert full.scatter == pytest.approx(quiet.scatter)
     assert control_chart(entries, "d_rms_px").unit == "px"
     with pytest.raises(InputError, match="three"):
         control_chart(entries[:2], "t_HT_y")
     path.write_text('{"schema": "tomopose/history/9"}\n', encoding="utf-8")
     with pytest.raises(SchemaVersionError, match="line 1"):
         read_history(path)
+
+
+def entry(value, u):
+    return {"parameters": {"t_HT_x": {"value": value, "u": u, "unit": "mm"}}, "time_utc": "", "d_rms_px": value}
+
+
+@pytest.mark.parametrize(("n", "bump"), [(6, 14.0), (20, 6.5)])
+@pytest.mark.parametrize("u", [1.0, 0.3])
+def test_a_single_bumped_run_is_flagged_among_few_and_many(n, bump, u):
+    """Runs scatter by 1, whether they state it (u 1) or not (u 0.3); one is off, wherever it stands."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        value = rng.normal(0, 1, n)
+        place = int(rng.integers(n))
+        value[place] = bump
+        chart = control_chart([entry(x, u) for x in value], "t_HT_x")
+        assert chart.out[place]
+        assert chart.out.sum() <= 2
+        assert np.ptp(chart.high) < 2.0 * bump
+        assert control_chart([entry(x, u) for x in value], "d_rms_px").out[place]
+
+
+@pytest.mark.parametrize(("n", "alarms"), [(6, 0.02), (20, 0.008)])
+def test_quiet_runs_stay_inside(n, alarms):
+    rng = np.random.default_rng(0)
+    out = [control_chart([entry(x, u) for x in rng.normal(0, 1, n)], "t_HT_x").out.mean()
+           for u in (1.0, 0.3) for _ in range(200)]
+    assert np.mean(out) < alarms
 
 
 FIELD = PoseField(translation=0.002, rotation=0.0, field_translation=0.01, field_rotation=0.0, length=8.0)
