@@ -104,7 +104,7 @@ def test_names_units_and_sizes() -> None:
     assert len(set(machine.names)) == 47
     assert len(replace(machine, scale_sigma=0.0, geometry_sigma=0.0).names) == 42
     assert machine.sigma.shape == (47,)
-    np.testing.assert_allclose(machine.resized(2.0).sigma[:42], 2 * machine.sigma[:42])
+    np.testing.assert_allclose(machine.resized(np.array([2.0])).sigma[:42], 2 * machine.sigma[:42])
 
 
 def test_singular_platform_is_named(rng: np.random.Generator) -> None:

@@ -24,12 +24,11 @@ REWEIGHTINGS = 15
 GROSS = 8.0
 """Times the median residual of the start: rows beyond it are no positioning errors of the same machine, and stay out of
 the first fit; what belongs comes back."""
-SIZE_STEPS = 4
+SIZE_STEPS = 8
 SMALLEST_SIZE, LARGEST_SIZE = 1e-3, 30.0
-GROUP_STEPS = 10
 DETERMINED, LEAST_KNOWN_SHARE = 0.5, 0.5
-"""A group of a map's terms takes its size from the data where they determine as much of it; turns take one of their own
-where the data determine that share of them."""
+"""Errors of a group that the data must determine before its size is taken from them; the share of a map's turns that
+must be, for a size of their own."""
 SIZE_GAIN = 3.0
 """Natural log units of evidence that another size of the errors must gain over the stated one to be believed."""
 
@@ -39,7 +38,7 @@ class ModelFit:
     """A model's optimum and how it was reached.
 
     keep (n,) bool: rows used, of all rows.  distance2 (n,): squared studentised residuals of all rows.
-    size: factor on the stated standard deviations of the errors.
+    size: largest factor on the stated standard deviations of the errors.
     """
 
     estimate: MapEstimate
@@ -108,49 +107,38 @@ def with_scatter(estimate: MapEstimate) -> MapEstimate:
 
 
 def with_size(estimate: MapEstimate) -> tuple[MapEstimate, float]:
-    """The estimate with the prior's size taken from the data where that is clearly better than the stated one.
+    """The estimate with the priors' sizes taken from the data where that is clearly better than the stated ones.
 
-    MacKay's rule: s^2 = sum (p/sigma)^2 / gamma, gamma the number of errors that the data determine.
+    MacKay's rule for each group of errors that one cause makes: s^2 = sum (p/sigma)^2 / gamma, gamma the number of
+    errors of the group that the data determine.  A map's sizes are nowhere stated, so they are always taken; its turns
+    keep their proportion to the shifts of the same group where the data do not determine them.  Returns the largest
+    factor too.
     """
     model = estimate.problem.model
     if model is None or not len(model.names):
         return estimate, 1.0
-    if isinstance(model, PoseMap):
-        return _with_group_sizes(estimate, model), 1.0
-    m = len(model.names)
-    size, now = 1.0, estimate
+    group, m = model.groups, len(model.names)
+    mine = group >= 0
+    members = np.bincount(group[mine])
+    sizes, now = np.ones(len(members)), estimate
     for _ in range(SIZE_STEPS):
         sigma = now.problem.prior_sigma[-m:]
-        gamma = m - float(np.sum(np.diag(now.covariance)[-m:] / sigma**2))
-        found = float(np.sqrt(np.sum((now.state.p / sigma) ** 2) / max(gamma, 1e-3)))
-        change = float(np.clip(size * found, SMALLEST_SIZE, LARGEST_SIZE)) / size
-        if abs(np.log(change)) < 0.1:
-            break
-        size *= change
-        now = solve_map(replace(now.problem, model=model.resized(size)), now.state)
-    return (now, size) if now.log_evidence > estimate.log_evidence + SIZE_GAIN else (estimate, 1.0)
-
-
-def _with_group_sizes(estimate: MapEstimate, model: PoseMap) -> MapEstimate:
-    """The estimate with every group of a map's terms sized by MacKay's rule.
-
-    Groups of turns that the data do not determine keep their proportion to the shifts of the same group.
-    """
-    half = model.group_count
-    for _ in range(GROUP_STEPS):
-        sigma, group = model.sigma, model.groups
-        m = len(sigma)
-        gamma = np.bincount(group, 1 - np.diag(estimate.covariance)[-m:] / sigma**2)
-        found = np.sqrt(np.bincount(group, (estimate.state.p / sigma) ** 2) / np.maximum(gamma, 1e-9))
-        change = np.where(gamma > DETERMINED, np.clip(found, 0.1, 10.0), 1.0)
-        turns_known = gamma[:half] > LEAST_KNOWN_SHARE * np.bincount(group)[:half]
-        change[:half] = np.where(turns_known, change[:half], change[half:])
+        known = 1 - np.diag(now.covariance)[-m:] / sigma**2
+        gamma = np.bincount(group[mine], known[mine])
+        found = np.sqrt(np.bincount(group[mine], (now.state.p / sigma)[mine] ** 2) / np.maximum(gamma, 1e-9))
+        change = np.where(gamma > DETERMINED, found, 1.0)
+        if isinstance(model, PoseMap):
+            half = model.group_count
+            change[:half] = np.where(gamma[:half] > LEAST_KNOWN_SHARE * members[:half], change[:half], change[half:])
+        change = np.clip(sizes * change, SMALLEST_SIZE, LARGEST_SIZE) / sizes
         if np.abs(np.log(change)).max() < 0.1:
             break
-        factors = np.clip(np.asarray(model.factors) * change, SMALLEST_SIZE, None)
-        model = replace(model, factors=tuple(factors.tolist()))
-        estimate = solve_map(replace(estimate.problem, model=model), estimate.state)
-    return estimate
+        sizes = sizes * change
+        now = solve_map(replace(now.problem, model=model.resized(sizes)), now.state)
+    if isinstance(model, PoseMap):
+        return now, 1.0
+    taken = now.log_evidence > estimate.log_evidence + SIZE_GAIN
+    return (now, float(sizes.max())) if taken else (estimate, 1.0)
 
 
 def fit_model(

@@ -43,6 +43,10 @@ GEOMETRY = tuple(
 GROUPS = (
     "base_joint", "platform_joint", "leg_offset", "geometry_scale", "geometry_base_radius", "leg_scale", "axes", "pivot"
 )
+SIZED = {
+    "base_joint": 0, "platform_joint": 0, "leg_offset": 0, "geometry_scale": -1, "geometry_base_radius": -1,
+    "leg_scale": 1, "axes": 2, "pivot": 3,
+}
 GEOMETRY_COLUMNS = {"geometry_scale": slice(0, 1), "geometry_base_radius": slice(1, 5)}
 LARGEST_STROKE = 2.0
 SINGULAR_CONDITION = 1e5
@@ -247,10 +251,17 @@ class Hexapod:
                 limits=self.leg_limits,
             )
 
-    def resized(self, size: float) -> Hexapod:
-        """The same hexapod with all standard deviations of its errors multiplied by `size`."""
-        names = ("joint_sigma", "leg_sigma", "leg_scale_sigma", "axes_sigma", "pivot_sigma")  # the file stays the file
-        return replace(self, **{name: size * getattr(self, name) for name in names})
+    @property
+    def groups(self) -> Any:
+        """(m,) int: joints and legs 0, spindles 1, axes 2, pivot 3; -1 for the geometry: the file stays the file."""
+        return np.array([SIZED[group] for group, (place, _) in self._split(np.zeros(len(self.names))).items()
+                         for _ in range(place.stop - place.start)])
+
+    def resized(self, sizes: Array) -> Hexapod:
+        """The same hexapod with the standard deviations of its errors multiplied by the factor of their group."""
+        factor = dict(enumerate(np.asarray(sizes, dtype=np.float64).tolist()))
+        group = {"joint_sigma": 0, "leg_sigma": 0, "leg_scale_sigma": 1, "axes_sigma": 2, "pivot_sigma": 3}
+        return replace(self, **{name: factor.get(k, 1.0) * getattr(self, name) for name, k in group.items()})
 
     def to_json(self) -> dict[str, Any]:
         """The content of hexapod.json."""

@@ -77,8 +77,12 @@ class InverseManipulator:
         J = np.concatenate([-R_T @ w, R_T @ (-skew(real.t) @ w - s)], axis=1)
         return RealPoses(R=R_T, t=-(R_T @ real.t[:, :, None])[..., 0], J=J)
 
-    def resized(self, size: float) -> InverseManipulator:
-        return InverseManipulator(machine=self.machine.resized(size))
+    @property
+    def groups(self) -> Any:
+        return self.machine.groups
+
+    def resized(self, sizes: Array) -> InverseManipulator:
+        return InverseManipulator(machine=self.machine.resized(sizes))
 
     def to_json(self) -> dict[str, Any]:
         return {"kind": self.machine.kind, "machine": self.machine.to_json()}

@@ -107,9 +107,9 @@ class PoseMap:
         J = np.einsum("nj,nab->najb", phi, J_out).reshape(len(poses), 6, -1)
         return RealPoses(R=R, t=t, J=J)
 
-    def resized(self, size: float) -> PoseMap:
-        """The same map with errors expected to be `size` times as large."""
-        return replace(self, t_sigma=size * self.t_sigma, w_sigma=size * self.w_sigma)
+    def resized(self, sizes: Array) -> PoseMap:
+        """The same map with errors expected to be `sizes` (a factor a group) times as large."""
+        return replace(self, factors=tuple((np.asarray(self.factors) * sizes).tolist()))
 
     def to_json(self) -> dict[str, Any]:
         return {

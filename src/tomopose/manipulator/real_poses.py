@@ -61,7 +61,8 @@ class RealPoses:
 
 
 class ErrorModel(Protocol):
-    """kind: "hexapod", "serial", "map"; names, units, sigma (m,): of the errors; repeatability: of the plate."""
+    """kind: "hexapod", "serial", "map"; names, units, sigma (m,): of the errors; groups (m,) int: errors that one cause
+    makes, whose size the data may correct together, -1 where it stays; repeatability: of the plate."""
 
     @property
     def kind(self) -> str: ...
@@ -72,14 +73,16 @@ class ErrorModel(Protocol):
     @property
     def sigma(self) -> Array: ...
     @property
+    def groups(self) -> Any: ...
+    @property
     def repeatability(self) -> Repeatability: ...
 
     def real_poses(self, poses: PoseSequence, p: Array) -> RealPoses:
         """Where the real plate stands when the controller is told `poses` and the machine has the errors p."""
         ...
 
-    def resized(self, size: float) -> ErrorModel:
-        """The same machine with the standard deviations of all its errors multiplied by `size`."""
+    def resized(self, sizes: Array) -> ErrorModel:
+        """The same machine with the standard deviations of its errors multiplied by the factor of their group."""
         ...
 
     def to_json(self) -> dict[str, Any]: ...

@@ -99,8 +99,12 @@ class WithRunEffects:
         k = DRIFT_ORDER * len(COORDINATES)
         return np.var(self._effects(poses)[:, :, :k] @ p[self.drift], axis=0)
 
-    def resized(self, size: float) -> WithRunEffects:
-        return replace(self, machine=self.machine.resized(size))
+    @property
+    def groups(self) -> Any:
+        return np.concatenate([self.machine.groups, np.full(len(self.names) - len(self.machine.names), -1)])
+
+    def resized(self, sizes: Array) -> WithRunEffects:
+        return replace(self, machine=self.machine.resized(sizes))
 
     def to_json(self) -> dict[str, Any]:
         return self.machine.to_json()

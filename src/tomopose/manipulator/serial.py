@@ -37,6 +37,8 @@ ERRORS: Mapping[str, str] = {
 }
 """Errors that a joint may have, and their units: length, twist, offset, joint zero, Hayati's turn, gear."""
 
+SIZED = {"a": 0, "d": 0, "alpha": 1, "theta_offset": 1, "beta": 1, "e_cos": 2, "e_sin": 2}
+
 IK_STEPS, IK_ROUNDS = 60, 5
 IK_TOLERANCE = 1e-12
 """Relative to the robot's length."""
@@ -301,9 +303,17 @@ class SerialRobot:
         T = T @ extra
         return RealPoses(R=T[:, :3, :3], t=T[:, :3, 3], J=J)
 
-    def resized(self, size: float) -> SerialRobot:
-        """The same robot with all standard deviations of its errors multiplied by `size`."""
-        joints = tuple(replace(j, sigma={k: size * v for k, v in j.sigma.items()}) for j in self.joints)
+    @property
+    def groups(self) -> Any:
+        """(m,) int: lengths 0, angles 1, gears 2."""
+        return np.array([SIZED[name] for _, name, _ in self._errors])
+
+    def resized(self, sizes: Array) -> SerialRobot:
+        """The same robot with the standard deviations of its errors multiplied by the factor of their group."""
+        factor = dict(enumerate(np.asarray(sizes, dtype=np.float64).tolist()))
+        joints = tuple(
+            replace(j, sigma={k: factor.get(SIZED[k], 1.0) * v for k, v in j.sigma.items()}) for j in self.joints
+        )
         return replace(self, joints=joints)
 
     def to_json(self) -> dict[str, Any]:
