@@ -13,9 +13,11 @@ from scipy.special import ndtr
 from tomopose.errors import FileError, InputError, UnitError
 from tomopose.geometry.rotations import exp_rotation
 from tomopose.measurement.alignment import Alignment, from_points
-from tomopose.measurement.comparison import compare, corrected_reference
+from tomopose.measurement.comparison import compare
 from tomopose.measurement.mesh_files import FILES, write_comparison
+from tomopose.measurement.mesh_refine import refined
 from tomopose.measurement.meshes import Mesh, read_mesh, signed_distances
+from tomopose.measurement.reference_correction import corrected_reference, read_probed_points
 from tomopose.volume import VoxelGrid
 
 V, SIGMA = 0.1, 0.1
@@ -142,6 +144,48 @@ def test_the_reference_follows_probed_points_but_not_at_edges(mesh, rng):
     on_top = (np.abs(mesh.points[:, 0] - HALF[0]) < 1e-9) & ~mesh.on_edge
     assert moved[on_top] == pytest.approx(np.broadcast_to([0.011, 0, 0], (on_top.sum(), 3)), abs=1e-12)
     assert not moved[~on_top].any()
+
+
+@pytest.mark.parametrize("interpolation", ["cells", "natural"])
+def test_each_probed_point_moves_its_own_cell_or_blends_with_its_neighbours(mesh, interpolation):
+    """Four points on the top face, one of them high: what happens at the points, between them and on other faces."""
+    top = HALF[2]
+    probed = np.array([[-0.75, -0.65, top], [0.75, -0.65, top], [-0.75, 0.65, top], [0.75, 0.65, top + 0.012]])
+    moved = corrected_reference(mesh, probed, interpolation=interpolation).points - mesh.points
+    on_top = (np.abs(mesh.points[:, 2] - top) < 1e-9) & ~mesh.on_edge
+    assert not moved[~on_top].any()
+    shift = moved[on_top, 2]
+    x = mesh.points[on_top]
+    at = [np.argmin(np.linalg.norm(x[:, :2] - p[:2], axis=1)) for p in probed]
+    assert shift[at] == pytest.approx([0, 0, 0, 0.012], abs=1e-9)
+    middle = (np.abs(x[:, :2]) < 0.3).all(axis=1) & (np.abs(x[:, :2]) > 1e-9).all(axis=1)
+    assert set(np.round(shift, 9)) == {0.0, 0.012} if interpolation == "cells" else 0.0 < shift[middle].mean() < 0.012
+
+
+def test_probed_points_from_a_table(tmp_path):
+    path = tmp_path / "cmm.csv"
+    path.write_text("# part coordinates\nx_mm,y_mm,z_mm\n1,2,3\n-1.5,0,2e-3\n", encoding="utf-8")
+    assert read_probed_points(path).tolist() == [[1, 2, 3], [-1.5, 0, 0.002]]
+    path.write_text("x,y,z\n1,2,3\n", encoding="utf-8")
+    with pytest.raises(UnitError, match="x_mm"):
+        read_probed_points(path)
+    path.write_text("x_mm,y_mm,z_mm\n1,2\n", encoding="utf-8")
+    with pytest.raises(FileError):
+        read_probed_points(path)
+
+
+def test_smaller_triangles_lie_on_the_same_surface():
+    coarse = box(np.array([1.0, 0.4, 0.7]), 1)
+    fine = refined(coarse, 0.13)
+    fine.require_closed()
+    ends = fine.points[fine.faces]
+    assert np.linalg.norm(ends - np.roll(ends, 1, axis=1), axis=2).max() <= 0.13
+    assert np.abs(signed_distances(fine.points, coarse)).max() < 1e-12
+    area = [0.5 * np.linalg.norm(m.face_normals, axis=1).sum() for m in (coarse, fine)]
+    assert area[0] == pytest.approx(area[1], rel=1e-12)
+    assert len(np.unique(fine.elements)) == 6
+    with pytest.raises(InputError, match="triangles"):
+        refined(coarse, 1e-5)
 
 
 def write_stl(path, mesh):

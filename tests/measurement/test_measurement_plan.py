@@ -11,6 +11,8 @@ from blurred_shapes import as_volume
 from scipy.special import ndtr
 
 from tomopose.errors import FileError, InputError, SchemaVersionError, UnitError
+from tomopose.geometry.rotations import exp_rotation, log_rotation
+from tomopose.measurement.alignment import datum, from_datums
 from tomopose.measurement.measure import measure
 from tomopose.measurement.plan import plan_from, plan_schema, read_plan
 from tomopose.measurement.results import write_results
@@ -120,12 +122,17 @@ def test_a_clean_block(plan):
     assert by_name["height"].value == pytest.approx(CENTRE[2] + HALF[2], abs=2e-6)
 
 
-def test_repeats_side_by_side_and_their_files(plan, tmp_path):
-    found = measure({f"scan {k}": block(0.03, k) for k in range(4)}, plan)
+def test_groups_of_repeats_side_by_side_and_their_files(document, tmp_path):
+    """Three scans repeat one measurement; a fourth is another trajectory and no repeat of them."""
+    document["repeats"] = {"3D scan": ["scan 0", "scan 1", "scan 2"]}
+    found = measure({f"scan {k}": block(0.03, k) for k in range(4)}, plan_from(document))
     assert found.volumes == ("scan 0", "scan 1", "scan 2", "scan 3")
-    repeat = {r.name: r for r in found.repeats()}["L1"]
-    values = [r.value for r in found.results if r.name == "L1"]
-    assert repeat.n == 4
+    repeats = found.repeats()
+    assert {r.group for r in repeats} == {"3D scan"}
+    repeat = {r.name: r for r in repeats}["L1"]
+    values = [r.value for r in found.results if r.name == "L1" and r.volume != "scan 3"]
+    assert repeat.n == 3
+    assert repeat.mean == pytest.approx(np.mean(values))
     assert repeat.s == pytest.approx(np.std(values, ddof=1))
     assert 2 * repeat.s <= repeat.U
     write_results(found, tmp_path / "out")
@@ -136,6 +143,104 @@ def test_repeats_side_by_side_and_their_files(plan, tmp_path):
     assert len(lines) == 17
     with pytest.raises(FileError, match="exists"):
         write_results(found, tmp_path / "out")
+
+
+def test_volumes_are_no_repeats_unless_the_plan_says_so(plan):
+    found = measure({"circular": block(0.03, 1), "tilted": block(0.03, 2)}, plan)
+    assert found.repeats() == ()
+
+
+def test_the_transform_of_each_volume_is_reported(plan):
+    found = measure(block(), plan)
+    alignment = found.alignments["volume"]
+    assert alignment.rule == "datum, 3-2-1"
+    assert alignment.t == pytest.approx(CENTRE, abs=1e-4)
+    assert found.to_json()["alignments"]["volume"]["rotation_vector_rad"] == pytest.approx(np.zeros(3), abs=1e-5)
+
+
+def turned_block(turn, shift):
+    """The block turned about its centre and moved, mm; blurred along its own axes, as sigma is the same along all."""
+    grid = VoxelGrid(shape=(62, 58, 60), spacing=np.full(3, V))
+    z, y, x = np.meshgrid(*(grid.origin[2 - a] + V * np.arange(grid.shape[a]) for a in range(3)), indexing="ij")
+    local = (np.stack([x, y, z], axis=-1) - CENTRE - shift) @ turn
+    values = np.ones(grid.shape)
+    for a in range(3):
+        values *= ndtr((local[..., a] + HALF[a]) / SIGMA) - ndtr((local[..., a] - HALF[a]) / SIGMA)
+    return as_volume(values, grid)
+
+
+@pytest.mark.parametrize("kind", ["datum", "best-fit"])
+def test_a_turned_part_is_found_by_datums_and_by_best_fit(document, kind):
+    turn, shift = exp_rotation(np.array([0.012, -0.009, 0.015])), np.array([0.03, -0.02, 0.04])
+    document["alignment"]["kind"] = kind
+    for feature in document["features"].values():
+        feature["source"] = "normals"
+    found = measure(turned_block(turn, shift), plan_from(document))
+    alignment = found.alignments["volume"]
+    assert np.linalg.norm(log_rotation(alignment.R @ turn.T)) < 3e-5
+    # The plan holds no face at the far side along y and x, so best fit and datums place the part alike.
+    assert alignment.t == pytest.approx(CENTRE + shift, abs=1e-4)
+    assert {r.name: r for r in found.results}["L1"].value == pytest.approx(3.84, abs=5e-5)
+
+
+def test_lines_and_circles_are_features_of_a_plan(document):
+    """A bore of 0.7 mm radius through a blurred slab: circle in it, line on its face."""
+    grid = VoxelGrid(shape=(40, 44, 46), spacing=np.full(3, V))
+    z, y, x = np.meshgrid(*(grid.origin[2 - a] + V * np.arange(grid.shape[a]) for a in range(3)), indexing="ij")
+    slab = ndtr((z + 1.21) / SIGMA) - ndtr((z - 1.21) / SIGMA)
+    values = slab * ndtr((np.hypot(x - 0.13, y + 0.07) - 0.7) / SIGMA)
+    features = {
+        "bore": {"kind": "circle", "point": [0.1, -0.1, 0.2], "direction": [0, 0, 1], "radius_mm": 0.7, "inward": True,
+                 "n_points": 200},
+        "track": {"kind": "line", "point": [0, 1.5, 1.21], "direction": [1, 0, 0], "normal": [0, 0, 1],
+                  "length_mm": 3.0, "safety_mm": 0.2, "n_points": 100},
+    }
+    measurands = [{"name": "D", "kind": "diameter", "of": ["bore"]}, {"name": "X", "kind": "x", "of": ["bore"]},
+                  {"name": "Z", "kind": "z", "of": ["track"]},
+                  {"name": "straightness", "kind": "form", "of": ["track"]},
+                  {"name": "between", "kind": "distance", "of": ["bore", "track"]}]
+    found = measure(as_volume(values, grid), plan_from(
+        document | {"features": features, "measurands": measurands, "alignment": {"kind": "none"}}))
+    value = {r.name: r.value for r in found.results}
+    assert value["D"] == pytest.approx(1.4, abs=2e-3)
+    assert value["X"] == pytest.approx(0.13, abs=1e-4)
+    assert value["Z"] == pytest.approx(1.21, abs=1e-4)
+    assert value["straightness"] < 1e-3
+    assert value["between"] == pytest.approx(np.hypot(1.5 + 0.07, 1.21 - 0.2), abs=1e-3)
+
+
+class TestDatums:
+    """3-2-1 from features of any kind: a known motion is found again."""
+
+    turn, shift = exp_rotation(np.array([0.3, -0.7, 1.1])), np.array([4.0, -3.0, 2.0])
+    plane = ("plane", [1.0, 2, 5], [0, 0, 1])
+    side = ("plane", [4.0, 0, 1], [1, 0, 0])
+    front = ("plane", [0.0, 7, 1], [0, 1, 0])
+    bore = ("cylinder", [2.0, 3, 1], [0, 0, 1])
+    pin = ("cylinder", [9.0, 1, 4], [0, 0, 1])
+    rod = ("cylinder", [1.0, 1, 3], [1, 0, 0])
+    ball = ("sphere", [6.0, -2, 1], None)
+
+    def found(self, *datums):
+        nominal = tuple(datum(*d) for d in datums)
+        measured = tuple(
+            datum(kind, self.turn @ x + self.shift, None if n is None else self.turn @ n) for kind, x, n in datums)
+        return from_datums(nominal, measured)
+
+    @pytest.mark.parametrize("names", [("plane", "side", "front"), ("plane", "bore", "pin"), ("plane", "rod", "ball"),
+                                       ("rod", "ball", "plane"), ("plane", "bore", "ball"), ("bore", "pin", "plane")])
+    def test_a_motion_is_found(self, names):
+        alignment = self.found(*(getattr(self, n) for n in names))
+        assert np.abs(alignment.R - self.turn).max() < 1e-12
+        assert np.abs(alignment.t - self.shift).max() < 1e-12
+
+    def test_what_stays_free_is_refused(self):
+        with pytest.raises(InputError, match="rotation about the first"):
+            self.found(self.plane, ("plane", [1.0, 2, 9], [0, 0, -1]), ("plane", [1.0, 2, 3], [0, 0, 1]))
+        with pytest.raises(InputError, match="free to move along"):
+            self.found(self.plane, self.side, ("plane", [8.0, 1, 2], [1, 0, 0]))
+        with pytest.raises(InputError, match="no direction"):
+            self.found(self.ball, self.plane, self.side)
 
 
 def test_the_same_numbers_twice(plan):
@@ -166,6 +271,29 @@ def test_a_plan_is_read_from_toml(tmp_path):
 
 
 class TestBadPlans:
+    def test_repeats_of_a_volume_that_is_not_there_or_twice(self, document):
+        with pytest.raises(InputError, match="absent"):
+            measure(block(), plan_from(document | {"repeats": {"a": ["absent", "volume"]}}))
+        with pytest.raises(InputError, match="two groups"):
+            plan_from(document | {"repeats": {"a": ["one", "two"], "b": ["two"]}})
+
+    def test_a_datum_that_is_no_feature(self, document):
+        document["alignment"]["datums"] = ["top", "front", "lid"]
+        with pytest.raises(InputError, match="lid"):
+            plan_from(document)
+
+    def test_a_circle_is_probed(self, document):
+        document["features"]["c"] = {"kind": "circle", "point": [0, 0, 0], "direction": [0, 0, 1], "radius_mm": 1,
+                                     "source": "surface"}
+        with pytest.raises(InputError, match="probed"):
+            plan_from(document)
+
+    def test_a_line_whose_normal_runs_along_it(self, document):
+        document["features"]["l"] = {"kind": "line", "point": [0, 0, 1.92], "direction": [1, 0, 0], "length_mm": 2,
+                                     "normal": [2, 0, 0]}
+        with pytest.raises(InputError, match="runs along it"):
+            measure(block(), plan_from(document))
+
     def test_another_schema(self, document):
         with pytest.raises(SchemaVersionError):
             plan_from(document | {"schema": "tomopose/measurement-plan/9"})

@@ -9,7 +9,7 @@ import numpy as np
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.rotations import exp_rotation, log_rotation
-from tomopose.measurement.features import Feature
+from tomopose.measurement.shapes import frame_along
 from tomopose.units import Array, float_array
 
 
@@ -59,30 +59,74 @@ def from_points(x_part: Array, x_W: Array) -> Alignment:
     return Alignment(R=R, t=x_W.mean(axis=0) - R @ x_part.mean(axis=0), rule="points, least squares")
 
 
-def from_datums(nominal: tuple[Array, Array, Array], normals: tuple[Array, Array, Array],
-                planes: tuple[Feature, Feature, Feature]) -> Alignment:
-    """3-2-1 from three planes (ISO 5459): the first fixes two rotations and a height, the second one rotation and a
-    place, the third the last place.
+@dataclass(frozen=True, kw_only=True)
+class Datum:
+    """What a feature fixes: a point (3,), a direction (3,) or None, and the directions (k, 3) in which it places the
+    part: one for a plane (its normal), two for an axis, three for a point."""
 
-    nominal, normals: points (3,) and outward normals (3,) of the planes in the part; planes: as measured in W, their
-    directions outward too.  InputError where two planes are nearly parallel.
+    point: Array
+    direction: Array | None
+    places: Array
+
+
+def datum(kind: str, point: Any, direction: Any) -> Datum:
+    """A feature as a datum; direction is ignored for spheres and calottes."""
+    x = np.asarray(point, dtype=np.float64)
+    if kind in ("sphere", "calotte"):
+        return Datum(point=x, direction=None, places=np.eye(3))
+    frame = frame_along(np.asarray(direction, dtype=np.float64))
+    places = {"plane": frame[2:], "circle": frame}.get(kind, frame[:2])
+    return Datum(point=x, direction=frame[2], places=places)
+
+
+def from_datums(nominal: tuple[Datum, Datum, Datum], measured: tuple[Datum, Datum, Datum]) -> Alignment:
+    """3-2-1 (ISO 5459): the first datum fixes two rotations, the second or third the last; then each places the part in
+    what those before it leave free.
+
+    nominal: in the part;  measured: in W, directions of the same sense.  The first needs a direction (plane or axis).
+    The last rotation comes from the first of these that is not along it: direction of the second, way from the first
+    axis to the second point, direction of the third, way from the second point to the third.
+    InputError where the datums leave a motion free.
     """
+    R = _turn(measured).T @ _turn(nominal)
+    t, free = np.zeros(3), np.eye(3)
+    for m, n in zip(measured, nominal, strict=True):
+        if not len(free):
+            break
+        # t moves only along what is still free: least squares of what this datum asks for.
+        asked = m.places @ (m.point - R @ n.point - t)
+        A = m.places @ free.T
+        u, s, vt = np.linalg.svd(A, full_matrices=True)
+        rank = int(np.count_nonzero(s > LEAST_SINE))
+        t = t + free.T @ (vt[:rank].T @ ((u[:, :rank].T @ asked) / s[:rank]))
+        free = vt[rank:] @ free
+    if len(free):
+        raise InputError(
+            f"the three datums leave the part free to move along {np.round(free[0], 3).tolist()}; choose others"
+        )
+    return Alignment(R=R, t=t, rule="datum, 3-2-1")
 
-    def triad(first: Array, second: Array) -> Array:
-        e_1 = first / np.linalg.norm(first)
-        e_2 = second - (second @ e_1) * e_1
-        if np.linalg.norm(e_2) < 0.1 * np.linalg.norm(second):
-            raise InputError("the first two datum planes are nearly parallel; choose others")
-        e_2 /= np.linalg.norm(e_2)
-        return np.stack([e_1, e_2, np.cross(e_1, e_2)])
 
-    R = triad(planes[0].direction, planes[1].direction).T @ triad(normals[0], normals[1])
-    N = np.stack([p.direction for p in planes])
-    if abs(np.linalg.det(N)) < 0.05:
-        raise InputError("the three datum planes meet in no point; choose planes of three directions")
-    # Each measured plane passes through the place of its nominal point.
-    places = [float((p.point - R @ x) @ p.direction) for p, x in zip(planes, nominal, strict=True)]
-    return Alignment(R=R, t=np.linalg.solve(N, np.array(places)), rule="datum, 3-2-1")
+LEAST_SINE = 0.05
+"""Sine of the angle between directions below which they count as parallel."""
+
+
+def _turn(datums: tuple[Datum, Datum, Datum]) -> Array:
+    """Rows e_1, e_2, e_3 of the frame that the datums span."""
+    first, second, third = datums
+    if first.direction is None:
+        raise InputError("the first datum has no direction; begin with a plane or an axis")
+    e_1 = first.direction
+    ways = [second.direction, second.point - first.point if len(first.places) > 1 else None, third.direction,
+            third.point - second.point]
+    for way in ways:
+        if way is None:
+            continue
+        across = way - (way @ e_1) * e_1
+        if np.linalg.norm(across) > LEAST_SINE * np.linalg.norm(way):
+            e_2 = across / np.linalg.norm(across)
+            return np.stack([e_1, e_2, np.cross(e_1, e_2)])
+    raise InputError("the datums leave the rotation about the first one free; choose others")
 
 
 def best_fit(start: Alignment, x_part: Array, normals: Array, distance: Array) -> Alignment:

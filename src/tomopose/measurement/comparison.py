@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tomopose.errors import EngineMissingError, InputError, ShapeError, UnitError
+from tomopose.errors import EngineMissingError, InputError, UnitError
 from tomopose.geometry.rotations import rotation_angle_between
 from tomopose.measurement.alignment import Alignment, best_fit
 from tomopose.measurement.contour import INSTALL_LINE
@@ -163,40 +163,6 @@ def _require_same_scale(reference: Mesh, volume: Volume) -> None:
             f"the reference is {reference.size:.4g} mm across, the volume {extent:.4g} mm: the reference seems to be "
             f"in {hint}; convert it to mm"
         )
-
-
-def corrected_reference(mesh: Mesh, probed: Any) -> Mesh:
-    """The reference shifted to points (n, 3), mm, that a coordinate measuring machine probed (paper ref. [21]).
-
-    Each vertex moves along its normal by the deviation of the probed point whose Voronoi cell it lies in, among the
-    points of its own element.  Vertices on sharp edges and elements without points stay nominal.
-
-    Raises ShapeError, or InputError where a point lies farther than a twentieth of the part's size from the mesh.
-    """
-    from scipy.spatial import cKDTree
-
-    x = np.asarray(probed, dtype=np.float64)
-    if x.ndim != 2 or x.shape[1] != 3 or not len(x):
-        raise ShapeError(f"probed points are (n, 3); got {x.shape}")
-    centroid = mesh.points[mesh.faces].mean(axis=1)
-    n = mesh.face_normals / np.maximum(np.linalg.norm(mesh.face_normals, axis=1), 1e-300)[:, None]
-    face = cKDTree(centroid).query(x)[1]
-    deviation = np.einsum("ij,ij->i", x - centroid[face], n[face])
-    far = np.abs(deviation) > 0.05 * mesh.size
-    if far.any():
-        raise InputError(
-            f"{int(far.sum())} of {len(x)} probed points lie up to {float(np.abs(deviation).max()):.3g} mm off the "
-            "reference; check unit and alignment"
-        )
-    points = np.array(mesh.points)
-    vertex_element = np.zeros(len(points), dtype=np.intp)
-    vertex_element[mesh.faces.ravel()] = np.repeat(mesh.elements, 3)
-    for element in np.unique(mesh.elements[face]):
-        mine = np.flatnonzero((vertex_element == element) & ~mesh.on_edge)
-        theirs = np.flatnonzero(mesh.elements[face] == element)
-        nearest = theirs[cKDTree(x[theirs]).query(mesh.points[mine])[1]]
-        points[mine] += deviation[nearest][:, None] * mesh.normals[mine]
-    return Mesh(points=points, faces=mesh.faces)
 
 
 def table(comparison: Comparison) -> str:

@@ -11,12 +11,12 @@ import numpy as np
 
 from tomopose.errors import InputError
 from tomopose.measurement import measurands as m
-from tomopose.measurement.alignment import Alignment, from_datums
+from tomopose.measurement.alignment import Alignment, Datum, best_fit, datum, from_datums
 from tomopose.measurement.edge_search import EdgeSettings, counts_in_words
 from tomopose.measurement.features import Feature
-from tomopose.measurement.fits import fit_cone, fit_cylinder, fit_plane, fit_sphere
+from tomopose.measurement.fits import fit_circle, fit_cone, fit_cylinder, fit_line, fit_plane, fit_sphere
 from tomopose.measurement.histogram import GreyLevels, given_levels, grey_levels
-from tomopose.measurement.plan import FeaturePlan, LimitPlan, MeasurandPlan, MeasurementPlan
+from tomopose.measurement.plan import FeaturePlan, LimitPlan, MeasurandPlan, MeasurementPlan, SpheresPlan
 from tomopose.measurement.probing import probe
 from tomopose.measurement.regions import nominal_pattern, surface_region
 from tomopose.measurement.results import MeasurementResult, MeasurementResults
@@ -26,7 +26,8 @@ from tomopose.provenance import Provenance
 from tomopose.units import Array
 from tomopose.volume import Volume
 
-DATUM_ROUNDS = 3
+ROUNDS = 3
+"""Times that an alignment is refined: the features are probed again where it puts them."""
 
 
 def measure(
@@ -46,28 +47,58 @@ def measure(
     named = {"volume": volumes} if isinstance(volumes, Volume) else dict(volumes)
     if not named:
         raise InputError("there is no volume to measure")
+    absent = sorted({v for group in plan.repeats.values() for v in group} - set(named))
+    if absent:
+        raise InputError(f"the plan's repeats name the volumes {', '.join(absent)}; given: {', '.join(named)}")
     results: list[MeasurementResult] = []
     features: dict[str, Mapping[str, Feature]] = {}
     notes: dict[str, tuple[str, ...]] = {}
     scale: dict[str, float] = {}
+    alignments: dict[str, Alignment] = {}
     for done, (name, volume) in enumerate(named.items()):
         one = _Bench(volume, plan)
-        alignment = one.alignment()
-        found = one.features(alignment)
-        rows = [_row(plan, p, found, alignment) for p in plan.measurands]
+        alignments[name] = one.alignment()
+        found = one.features(alignments[name])
         if plan.spheres is not None:
-            balls, more, factor, remarks = one.spheres()
-            found, scale[name] = {**found, **balls}, factor
-            rows += more
-            one.notes += remarks
-        results += [replace(r, volume=name) for r in rows]
+            balls, scale[name] = one.spheres()
+            found = {**found, **balls}
+        results += [replace(r, volume=name) for r in evaluate(plan, found, alignments[name], scale.get(name, 1.0))]
         features[name], notes[name] = found, tuple(one.notes)
         if progress is not None:
             progress(done + 1, len(named))
     return MeasurementResults(
-        plan_name=plan.name, results=tuple(results), features=features, notes=notes, scale=scale,
-        spacing_mm={n: float(v.grid.spacing.max()) for n, v in named.items()}, provenance=provenance,
+        plan_name=plan.name, results=tuple(results), features=features, notes=notes, scale=scale, alignments=alignments,
+        groups=plan.repeats, spacing_mm={n: float(v.grid.spacing.max()) for n, v in named.items()},
+        provenance=provenance,
     )
+
+
+def evaluate(
+    plan: MeasurementPlan, features: Mapping[str, Feature], alignment: Alignment, scale: float = 1.0
+) -> list[MeasurementResult]:
+    """All measurands of a plan from its fitted features (those of a multi-sphere standard by `sphere_name`)."""
+    rows = [_row(plan, p, features, alignment) for p in plan.measurands]
+    return rows if plan.spheres is None else rows + _sphere_rows(plan, plan.spheres, features, scale)
+
+
+def refitted(feature: Feature, points: Array) -> Feature:
+    """The feature fitted again to points (n, 3) that stand for its used ones, about where it was: no outlier rule, no
+    correlation, radius held where it was held."""
+    held = feature.radius if feature.kind in ("sphere", "calotte") and feature.covariance[6, 6] == 0 else None
+    if feature.kind in ("sphere", "calotte"):
+        again = fit_sphere(points, radius=held)
+    elif feature.kind in ("cylinder", "cone"):
+        again = (fit_cylinder if feature.kind == "cylinder" else fit_cone)(points, direction=feature.direction)
+    else:
+        again = {"plane": fit_plane, "line": fit_line, "circle": fit_circle}[feature.kind](points)
+    if feature.kind in ("plane", "cylinder") and again.direction @ feature.direction < 0:
+        again = _turned(again)
+    return replace(again, kind=feature.kind)
+
+
+def sphere_name(k: int) -> str:
+    """Name of the feature that is sphere k, from 0, of a multi-sphere standard."""
+    return f"sphere {k + 1:02d}"
 
 
 class _Bench:
@@ -111,17 +142,37 @@ class _Bench:
         alignment = Alignment(R=rows[:, :3], t=rows[:, 3], rule="given")
         if a.kind == "none":
             return alignment
-        plans = [self.plan.features[d] for d in a.datums]
-        for _ in range(DATUM_ROUNDS):
-            fits = [self._feature(d, p, alignment) for d, p in zip(a.datums, plans, strict=True)]
-            x_1, x_2, x_3 = (np.asarray(p.point, dtype=np.float64) for p in plans)
-            n_1, n_2, n_3 = (_outward(p) for p in plans)
-            alignment = from_datums((x_1, x_2, x_3), (n_1, n_2, n_3), (fits[0], fits[1], fits[2]))
+        for _ in range(ROUNDS):
+            alignment = self._by_datums(alignment) if a.kind == "datum" else self._by_all(alignment)
         self.notes.append(
             f"alignment {alignment.rule}: R = {np.round(alignment.R, 8).tolist()}, t = "
             f"{np.round(alignment.t, 5).tolist()} mm"
         )
         return alignment
+
+    def _by_datums(self, alignment: Alignment) -> Alignment:
+        """3-2-1, datums measured where the alignment puts them."""
+        nominal: list[Datum] = []
+        measured: list[Datum] = []
+        for name in self.plan.alignment.datums:
+            p = self.plan.features[name]
+            f = self._feature(name, p, alignment)
+            direction = _outward(p) if p.kind == "plane" else p.direction
+            nominal.append(datum(p.kind, p.point, direction))
+            along = None if direction is None or f.kind in ("sphere", "calotte") else f.direction
+            if along is not None and along @ alignment.directions(direction) < 0:
+                along = -along
+            measured.append(datum(p.kind, f.point, along))
+        return from_datums((nominal[0], nominal[1], nominal[2]), (measured[0], measured[1], measured[2]))
+
+    def _by_all(self, alignment: Alignment) -> Alignment:
+        """One step of the best fit of all features to their nominal geometry."""
+        patterns = [nominal_pattern(p, alignment) for p in self.plan.features.values()]
+        x, n = (np.concatenate([p[k] for p in patterns]) for k in (0, 1))
+        found = probe(self.volume, x, n, settings=self.settings, contrast=self.levels.contrast)
+        good = found.good
+        return best_fit(alignment, (x[good] - alignment.t) @ alignment.R, n[good] @ alignment.R,
+                        found.edges.offset[good])
 
     def _feature(self, name: str, plan: FeaturePlan, alignment: Alignment) -> Feature:
         try:
@@ -149,8 +200,8 @@ class _Bench:
                 )
             return s.points[chosen], s.normals[chosen], s.sigma
         x, n = nominal_pattern(plan, alignment)
-        # Shared plateaus make points quieter, not lengths, and errors common to a whole small feature do not show in its
-        # residuals: each point keeps its own.
+        # Shared plateaus make points quieter, not lengths, and errors common to a whole small feature do not show in
+        # its residuals: each point keeps its own.
         own = replace(self.settings, plateau_radius=0.0)
         found = probe(self.volume, x, n, settings=own, contrast=self.levels.contrast)
         lost = int((~found.good).sum())
@@ -161,16 +212,17 @@ class _Bench:
     def _fitted(self, plan: FeaturePlan, alignment: Alignment, points: Array) -> Feature:
         reach = CORRELATION_VOXELS * float(self.volume.grid.spacing.max())
         outliers = plan.outliers
-        if plan.kind == "plane":
-            return fit_plane(points, outliers=outliers, correlation_range=reach)
+        simple = {"plane": fit_plane, "line": fit_line, "circle": fit_circle}
+        if plan.kind in simple:
+            return simple[plan.kind](points, outliers=outliers, correlation_range=reach)
         if plan.kind in ("sphere", "calotte"):
             held = plan.radius_mm if plan.fixed_radius else None
             return fit_sphere(points, radius=held, outliers=outliers, correlation_range=reach)
         fit = fit_cylinder if plan.kind == "cylinder" else fit_cone
         return fit(points, direction=alignment.directions(plan.direction), outliers=outliers, correlation_range=reach)
 
-    def spheres(self) -> tuple[dict[str, Feature], list[MeasurementResult], float, list[str]]:
-        """The multi-sphere standard: features, results (distances, diameters, sphericities), scale, remarks."""
+    def spheres(self) -> tuple[dict[str, Feature], float]:
+        """The multi-sphere standard: its spheres by name, and the factor on its lengths."""
         plan = self.plan.spheres
         if plan is None:
             raise InputError("the plan has no spheres")
@@ -181,34 +233,41 @@ class _Bench:
         )
         numbers = sorted(fits)
         factor = scale_factor(np.array([fits[k].point for k in numbers]), calibrated[numbers])
-        remarks = [f"spheres: {len(numbers)} of {len(calibrated)} found and identified, rms {which.rms * 1000:.1f} um",
-                   f"scale factor from centre distances: {factor:.8f}, "
-                   f"{'applied' if plan.scale_correction else 'not applied'}"]
+        self.notes += [
+            f"spheres: {len(numbers)} of {len(calibrated)} found and identified, rms {which.rms * 1000:.1f} um",
+            f"scale factor from centre distances: {factor:.8f}, "
+            f"{'applied' if plan.scale_correction else 'not applied'}",
+        ]
         missing = [k + 1 for k in range(len(calibrated)) if k not in fits]
         if missing:
-            remarks.append(f"spheres not found: {missing}")
-        used = factor if plan.scale_correction else 1.0
-        rows = []
-        for i, j in combinations(numbers, 2):
-            true = float(np.linalg.norm(calibrated[i] - calibrated[j]))
-            name, found = f"SD {i + 1:02d}-{j + 1:02d}", m.distance(fits[i], fits[j])
-            rows.append(self._ball_row(name, "distance", found, used, true, plan.u_distance_mm, plan.mpe_distance))
-        diameters = plan.calibrated_diameters_mm or (plan.diameter_mm,) * len(calibrated)
-        for k in numbers:
-            rows.append(self._ball_row(f"D {k + 1:02d}", "diameter", m.diameter(fits[k]), used, diameters[k],
-                                       plan.u_diameter_mm, plan.mpe_diameter))
-        for which_form in ("form", "form_95", "form_25"):
-            for k in numbers:
-                found = m.form(fits[k], which_form)
-                rows.append(self._ball_row(f"{which_form} {k + 1:02d}", which_form, found, used, None, 0.0, None))
-        return {f"sphere {k + 1:02d}": fits[k] for k in numbers}, rows, used, remarks
+            self.notes.append(f"spheres not found: {missing}")
+        return {sphere_name(k): fits[k] for k in numbers}, factor if plan.scale_correction else 1.0
 
-    def _ball_row(
-        self, name: str, kind: str, found: m.Measured, scale: float, reference: float | None, u_reference: float,
-        limit: LimitPlan | None,
-    ) -> MeasurementResult:
+
+def _sphere_rows(
+    plan: MeasurementPlan, spheres: SpheresPlan, features: Mapping[str, Feature], scale: float
+) -> list[MeasurementResult]:
+    """Distances, diameters and form deviations of the spheres that were found; lengths times `scale`."""
+    calibrated = np.array(spheres.centres)
+    fits = {k: features[sphere_name(k)] for k in range(len(calibrated)) if sphere_name(k) in features}
+
+    def row(name: str, kind: str, found: m.Measured, reference: float | None, u_reference: float = 0.0,
+            limit: LimitPlan | None = None) -> MeasurementResult:
         scaled = replace(found, value=found.value * scale, u=found.u * scale)
-        return _result(self.plan, name, kind, scaled, reference, u_reference, _mpe(limit, reference), "MPE")
+        return _result(plan, name, kind, scaled, reference, u_reference, _mpe(limit, reference), "MPE")
+
+    rows = []
+    for i, j in combinations(fits, 2):
+        true = float(np.linalg.norm(calibrated[i] - calibrated[j]))
+        rows.append(row(f"SD {i + 1:02d}-{j + 1:02d}", "distance", m.distance(fits[i], fits[j]), true,
+                        spheres.u_distance_mm, spheres.mpe_distance))
+    diameters = spheres.calibrated_diameters_mm or (spheres.diameter_mm,) * len(calibrated)
+    for k, f in fits.items():
+        rows.append(row(f"D {k + 1:02d}", "diameter", m.diameter(f), diameters[k], spheres.u_diameter_mm,
+                        spheres.mpe_diameter))
+    for which_form in ("form", "form_95", "form_25"):
+        rows += [row(f"{which_form} {k + 1:02d}", which_form, m.form(f, which_form), None) for k, f in fits.items()]
+    return rows
 
 
 def _outward(plan: FeaturePlan) -> Array:
@@ -224,9 +283,9 @@ def _turned(plane: Feature) -> Feature:
 
 
 def _curvature_corrected(feature: Feature, sigma: float) -> Feature:
-    """A ball's radius plus sigma^2 / R, a cylinder's or a cone's plus half of that: blur moves a curved surface towards
-    its centre, whichever side the material is on."""
-    share = {"sphere": 1.0, "calotte": 1.0, "cylinder": 0.5, "cone": 0.5}.get(feature.kind)
+    """A ball's radius plus sigma^2 / R, a cylinder's, a cone's or a circle's plus half of that: blur moves a curved
+    surface towards its centre, whichever side the material is on."""
+    share = {"sphere": 1.0, "calotte": 1.0, "cylinder": 0.5, "cone": 0.5, "circle": 0.5}.get(feature.kind)
     if share is None:
         return feature
     vector = np.array(feature.vector)

@@ -103,10 +103,10 @@ def _nearest(t: Any, x: Any, y: Any, z: Any) -> Any:
 
 @njit(cache=True, parallel=True)
 def tree_distances(points: Any, corners: Any, order: Any, box: Any, span: Any, second: Any, normals: Any) -> Any:
-    """(n,) signed distances of points (n, 3) to triangles: corners (m, 9) and normals (m, 7, 3), of the face, its edges
-    ab, bc, ca and its corners, both in the tree's order."""
+    """(n,) signed distances of points (n, 3) to triangles, and which of them, in the tree's order, is nearest: corners
+    (m, 9) and normals (m, 7, 3), of the face, its edges ab, bc, ca and its corners, both in the tree's order."""
     n = points.shape[0]
-    out = np.empty(n)
+    out, triangle = np.empty(n), np.empty(n, dtype=np.int64)
     for i in prange(n):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         nodes, apart = np.empty(DEPTH, dtype=np.int64), np.empty(DEPTH)
@@ -137,5 +137,5 @@ def tree_distances(points: Any, corners: Any, order: Any, box: Any, span: Any, s
                 nodes[waiting], apart[waiting] = near, d_near
                 waiting += 1
         along = bx * normals[where, part, 0] + by * normals[where, part, 1] + bz * normals[where, part, 2]
-        out[i] = np.sqrt(best) if along >= 0.0 else -np.sqrt(best)
-    return out
+        out[i], triangle[i] = (np.sqrt(best) if along >= 0.0 else -np.sqrt(best)), where
+    return out, triangle

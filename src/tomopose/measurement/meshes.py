@@ -143,18 +143,24 @@ class Mesh:
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """A mesh from STL (binary or text) or PLY (text or binary little-endian), in mm; equal vertices of STL are joined.
+    """A mesh from STL (binary or text), PLY (text or binary little-endian), in mm, or STEP; equal vertices are joined.
 
-    FileError where the file is missing, of another kind or damaged.
+    FileError where the file is missing, of another kind or damaged; EngineMissingError for STEP without cascadio.
     """
     path = Path(path)
+    if path.suffix.lower() in (".step", ".stp"):
+        from tomopose.measurement.step_files import read_step
+
+        return read_step(path)
     try:
         content = path.read_bytes()
     except OSError as error:
         raise FileError(f"{path} cannot be read: {error.strerror or error}", path=path) from error
     reader = {".stl": _read_stl, ".ply": _read_ply}.get(path.suffix.lower())
     if reader is None:
-        raise FileError(f"{path}: {path.suffix!r} is no mesh format that is read here; .stl and .ply are", path=path)
+        raise FileError(
+            f"{path}: {path.suffix!r} is no mesh format that is read here; .stl, .ply and .step are", path=path
+        )
     try:
         return reader(content)
     except (ValueError, IndexError, KeyError, struct.error) as error:
@@ -227,6 +233,11 @@ def signed_distances(points: Array, mesh: Mesh) -> Array:
 
     Exact.  ShapeError for points of another shape, InputError for a mesh that is not closed or faces inwards.
     """
+    return nearest_triangles(points, mesh)[0]
+
+
+def nearest_triangles(points: Array, mesh: Mesh) -> tuple[Array, np.ndarray]:
+    """As `signed_distances`, and which triangle (n,) is the nearest."""
     from tomopose.measurement.mesh_distance import build_tree, tree_distances
 
     x = np.ascontiguousarray(points, dtype=np.float64)
@@ -237,6 +248,7 @@ def signed_distances(points: Array, mesh: Mesh) -> Array:
     mesh.require_closed()
     corners = mesh.points[mesh.faces]
     order, box, span, second = build_tree(corners.min(axis=1), corners.max(axis=1), corners.mean(axis=1))
-    return np.asarray(
-        tree_distances(x, corners[order].reshape(-1, 9), order, box, span, second, mesh.pseudo_normals[order])
+    distance, where = tree_distances(
+        x, corners[order].reshape(-1, 9), order, box, span, second, mesh.pseudo_normals[order]
     )
+    return distance, order[where]

@@ -24,7 +24,9 @@ NEEDS = {
     "calotte": ("point", "radius_mm", "direction", "cap_deg"),
     "cylinder": ("point", "direction", "radius_mm", "length_mm"),
     "cone": ("point", "direction", "radius_mm", "length_mm", "half_angle_deg"),
+    "circle": ("point", "direction", "radius_mm"), "line": ("point", "direction", "normal", "length_mm"),
 }
+PROBED_ONLY = ("circle", "line")
 PAIRS = ("distance", "angle")
 
 
@@ -51,11 +53,13 @@ class FeaturePlan(_Strict):
 
     source: normals probes along the nominal normals; surface takes vertices of the measured surface.
     inward: the material lies outside, as at a bore.
+    A circle is probed radially, a line along `normal`, which points from material to air.
     """
 
-    kind: Literal["plane", "sphere", "calotte", "cylinder", "cone"]
+    kind: Literal["plane", "line", "circle", "sphere", "calotte", "cylinder", "cone"]
     point: Vector
     direction: Vector | None = None
+    normal: Vector | None = None
     radius_mm: Positive | None = None
     length_mm: Positive | None = None
     half_angle_deg: Annotated[float, Field(gt=0, lt=90)] | None = None
@@ -76,6 +80,8 @@ class FeaturePlan(_Strict):
         missing = [name for name in NEEDS[self.kind] if getattr(self, name) is None]
         if missing:
             raise ValueError(f"a {self.kind} needs {', '.join(missing)}")
+        if self.kind in PROBED_ONLY and self.source != "normals":
+            raise ValueError(f'a {self.kind} is probed: source = "normals"')
         return self
 
 
@@ -145,10 +151,11 @@ class SpheresPlan(_Strict):
 class AlignmentPlan(_Strict):
     """Where the part lies in W.
 
-    start: rows of (3, 4), part coordinates to W, mm;  kind: none keeps it; datum refines it by three planes, 3-2-1.
+    start: rows of (3, 4), part coordinates to W, mm;  kind: none keeps it; datum refines it by three features, 3-2-1;
+    best-fit moves it until all features together lie as near to their nominal places as they can.
     """
 
-    kind: Literal["none", "datum"] = "none"
+    kind: Literal["none", "datum", "best-fit"] = "none"
     start: tuple[tuple[float, float, float, float], ...] = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0))
     datums: tuple[str, ...] = ()
 
@@ -157,12 +164,16 @@ class AlignmentPlan(_Strict):
         if len(self.start) != 3:
             raise ValueError(f"start has {len(self.start)} rows; 3 of 4 numbers are needed")
         if self.kind == "datum" and len(self.datums) != 3:
-            raise ValueError(f"datum alignment needs three planes in datums; got {list(self.datums)}")
+            raise ValueError(f"datum alignment needs three features in datums; got {list(self.datums)}")
         return self
 
 
 class MeasurementPlan(_Strict):
-    """A whole plan."""
+    """A whole plan.
+
+    repeats: name of a group -> the volumes that repeat one measurement; volumes of other groups (another trajectory,
+    another calibration) stand beside them, and a volume in no group stands alone.
+    """
 
     schema_: Literal["tomopose/measurement-plan/1"] = Field(alias="schema")
     unit: Literal["mm"]
@@ -174,6 +185,7 @@ class MeasurementPlan(_Strict):
     features: dict[str, FeaturePlan] = {}
     measurands: tuple[MeasurandPlan, ...] = ()
     spheres: SpheresPlan | None = None
+    repeats: dict[str, tuple[str, ...]] = {}
 
     @model_validator(mode="after")
     def _consistent(self) -> MeasurementPlan:
@@ -189,9 +201,15 @@ class MeasurementPlan(_Strict):
         twice = sorted({n for n in names if names.count(n) > 1})
         if twice:
             raise ValueError(f"measurands named twice: {', '.join(twice)}")
-        wrong = [d for d in self.alignment.datums if d not in known or self.features[d].kind != "plane"]
+        wrong = [d for d in self.alignment.datums if d not in known]
         if wrong:
-            raise ValueError(f"datums must be planes of the plan; {', '.join(wrong)} is none")
+            raise ValueError(f"datums must be features of the plan; {', '.join(wrong)} is none")
+        if self.alignment.kind == "best-fit" and not known:
+            raise ValueError("best-fit alignment needs features")
+        members = [v for group in self.repeats.values() for v in group]
+        shared = sorted({v for v in members if members.count(v) > 1})
+        if shared:
+            raise ValueError(f"volumes in two groups of repeats: {', '.join(shared)}")
         if not self.measurands and self.spheres is None:
             raise ValueError("the plan measures nothing: give measurands or spheres")
         return self

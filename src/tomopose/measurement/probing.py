@@ -106,3 +106,24 @@ def plane_pattern(point: Any, normal: Any, u: Any, v: Any, n: int) -> tuple[Arra
     points = (s[:, None, None] * u + t[None, :, None] * v).reshape(-1, 3)
     out = np.asarray(normal, dtype=np.float64)
     return np.asarray(point, dtype=np.float64) + points, np.broadcast_to(out / np.linalg.norm(out), points.shape).copy()
+
+
+def circle_pattern(centre: Any, direction: Any, radius: float, n: int) -> tuple[Array, Array]:
+    """n points on a circle about `direction`, with normals away from its centre."""
+    frame = frame_along(np.asarray(direction, dtype=np.float64))
+    a = 2 * np.pi * np.arange(n) / n
+    normals = np.cos(a)[:, None] * frame[0] + np.sin(a)[:, None] * frame[1]
+    return np.asarray(centre, dtype=np.float64) + radius * normals, normals
+
+
+def line_pattern(point: Any, direction: Any, normal: Any, length: float, n: int) -> tuple[Array, Array]:
+    """n points on a line of `length` mm about `point`, with the normal given, made perpendicular to the line."""
+    along = frame_along(np.asarray(direction, dtype=np.float64))[2]
+    out = np.asarray(normal, dtype=np.float64)
+    out = out - (out @ along) * along
+    size = float(np.linalg.norm(out))
+    if size < 1e-6:
+        raise InputError("the normal of a line runs along it; give the direction from material to air")
+    s = ((np.arange(n) + 0.5) / n - 0.5) * length
+    x = np.asarray(point, dtype=np.float64) + s[:, None] * along
+    return x, np.broadcast_to(out / size, x.shape).copy()

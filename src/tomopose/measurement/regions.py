@@ -12,7 +12,7 @@ import numpy as np
 from tomopose.errors import InputError
 from tomopose.measurement.alignment import Alignment
 from tomopose.measurement.plan import FeaturePlan
-from tomopose.measurement.probing import cylinder_pattern, plane_pattern, sphere_pattern
+from tomopose.measurement.probing import circle_pattern, cylinder_pattern, line_pattern, plane_pattern, sphere_pattern
 from tomopose.measurement.shapes import frame_along
 from tomopose.units import Array
 
@@ -49,6 +49,13 @@ def nominal_pattern(plan: FeaturePlan, alignment: Alignment) -> tuple[Array, Arr
         _require_left(plan.kind, float(min(np.linalg.norm(w) for w in (u, v))) - s)
         half_u, half_v = (alignment.directions(w) for w in sides)
         x, n = plane_pattern(point, alignment.directions(plan.direction), half_u, half_v, plan.n_points)
+    elif plan.kind == "circle":
+        x, n = circle_pattern(point, alignment.directions(plan.direction), _given(plan.radius_mm), plan.n_points)
+    elif plan.kind == "line":
+        length = _given(plan.length_mm) - 2 * s
+        _require_left(plan.kind, length)
+        x, n = line_pattern(point, alignment.directions(plan.direction), alignment.directions(plan.normal), length,
+                            plan.n_points)
     else:
         length = _given(plan.length_mm) - 2 * s
         _require_left(plan.kind, length)

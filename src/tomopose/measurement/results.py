@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from tomopose.files import atomic_folder, write_json, write_text
+from tomopose.measurement.alignment import Alignment
 from tomopose.measurement.features import Feature
 from tomopose.provenance import Provenance
 
@@ -78,11 +79,12 @@ class MeasurementResult:
 
 @dataclass(frozen=True, kw_only=True)
 class Repeat:
-    """A measurand over several volumes: mean, standard deviation s, and the expanded uncertainty of VDI/VDE 2630-2.1:
+    """A measurand over a group of repeats: mean, standard deviation s, expanded uncertainty after VDI/VDE 2630-2.1:
 
     U = k sqrt(u_cal^2 + s^2 + u_fit^2) + |b|, k = 2, b the mean error, where a reference is given.
     """
 
+    group: str
     name: str
     n: int
     mean: float
@@ -97,7 +99,8 @@ class MeasurementResults:
     """Everything that `measure` found.
 
     results:  all measurands of all volumes;  features: volume -> name -> feature;  notes: volume -> remarks;
-    scale:    volume -> factor that lengths were multiplied by (1 where no correction was made).
+    scale:    volume -> factor that lengths were multiplied by (1 where no correction was made);
+    alignments: volume -> part to W;  groups: name -> volumes that repeat one measurement.
     """
 
     plan_name: str
@@ -106,6 +109,8 @@ class MeasurementResults:
     notes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     scale: Mapping[str, float] = field(default_factory=dict)
     spacing_mm: Mapping[str, float] = field(default_factory=dict)
+    alignments: Mapping[str, Alignment] = field(default_factory=dict)
+    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     provenance: Provenance | None = None
 
     def __len__(self) -> int:
@@ -120,11 +125,12 @@ class MeasurementResults:
         return tuple(r for r in self.results if r.volume == volume)
 
     def repeats(self) -> tuple[Repeat, ...]:
-        """Each measurand over all volumes, taken as repeats of one measurement; empty with one volume."""
-        if len(self.volumes) < 2:
-            return ()
-        names = list(dict.fromkeys(r.name for r in self.results))
-        return tuple(_repeat(name, [r for r in self.results if r.name == name]) for name in names)
+        """Each measurand over each group of at least two volumes."""
+        return tuple(
+            _repeat(group, name, rows)
+            for group, volumes in self.groups.items() if len(volumes) > 1
+            for name, rows in _by_name(r for r in self.results if r.volume in volumes).items()
+        )
 
     @property
     def out_of_limits(self) -> tuple[MeasurementResult, ...]:
@@ -133,7 +139,8 @@ class MeasurementResults:
     def to_json(self) -> dict[str, Any]:
         return {
             "plan": self.plan_name, "volumes": list(self.volumes), "spacing_mm": dict(self.spacing_mm),
-            "scale": dict(self.scale),
+            "scale": dict(self.scale), "groups": {g: list(v) for g, v in self.groups.items()},
+            "alignments": {v: a.to_json() for v, a in self.alignments.items()},
             "results": [r.to_json() for r in self.results],
             "repeats": [vars(r) for r in self.repeats()],
             "features": {v: {n: f.to_json() for n, f in found.items()} for v, found in self.features.items()},
@@ -159,7 +166,14 @@ def write_results(results: MeasurementResults, folder: str | Path, *, force: boo
         write_text(temporary / "measurement.csv", results.to_csv())
 
 
-def _repeat(name: str, rows: list[MeasurementResult]) -> Repeat:
+def _by_name(rows: Iterable[MeasurementResult]) -> dict[str, list[MeasurementResult]]:
+    found: dict[str, list[MeasurementResult]] = {}
+    for r in rows:
+        found.setdefault(r.name, []).append(r)
+    return found
+
+
+def _repeat(group: str, name: str, rows: list[MeasurementResult]) -> Repeat:
     values = np.array([r.value for r in rows])
     s = float(values.std(ddof=1)) if len(values) > 1 else math.nan
     u_fit = float(np.nanmean([r.u for r in rows])) if any(math.isfinite(r.u) for r in rows) else 0.0
@@ -167,4 +181,5 @@ def _repeat(name: str, rows: list[MeasurementResult]) -> Repeat:
     error = None if reference is None else float(values.mean()) - reference
     # The spread of repeats holds the fit's noise already; the larger of the two stands for both.
     U = 2.0 * math.sqrt(rows[0].u_reference**2 + max(s, u_fit) ** 2) + (0.0 if error is None else abs(error))
-    return Repeat(name=name, n=len(rows), mean=float(values.mean()), s=s, unit=rows[0].unit, error=error, U=U)
+    return Repeat(group=group, name=name, n=len(rows), mean=float(values.mean()), s=s, unit=rows[0].unit, error=error,
+                  U=U)
