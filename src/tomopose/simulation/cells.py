@@ -16,6 +16,9 @@ from tomopose.units import Array
 
 HELD = 6
 """Numbers of a cell."""
+SMOOTH = 1e-3
+"""Largest third difference of transmission over the corners that counts as smooth.  Means are exact for cubics; a kink
+that hides below it, between facets of a mesh, changes a pixel by a sixteenth of it."""
 
 
 def fibonacci_lattice(n: int, k: int) -> Array:
@@ -40,7 +43,9 @@ def gather_value(M: Any, value: float, x: float, y: float) -> None:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def add(out: Any, row: int, column: int, m: float, m_u: float, m_v: float, m_uv: float, m_uu: float, m_vv: float) -> None:
+def add(
+    out: Any, row: int, column: int, m: float, m_u: float, m_v: float, m_uv: float, m_uu: float, m_vv: float
+) -> None:
     out[0, row, column] += m
     out[1, row, column] += m_u
     out[2, row, column] += m_v
@@ -69,7 +74,7 @@ def add_moments(out: Any, row: int, column: int, weight: float, f: int, M: Any, 
 
 
 @njit(cache=True, nogil=True)
-def _smooth(I: Any, seen: Any, j: int, i: int, most: float) -> bool:
+def _smooth(I: Any, seen: Any, j: int, i: int) -> bool:
     """Whether the pixel with lower corner (j, i) and its eight neighbours see the same surfaces, and no third
     difference between them exceeds `most`."""
     here = seen[j, i]
@@ -83,31 +88,68 @@ def _smooth(I: Any, seen: Any, j: int, i: int, most: float) -> bool:
     if j_1 - j_0 < 3 or i_1 - i_0 < 3:
         return False
     for k in range(2):
-        if abs(I[j - 1, i + k] - 3 * I[j, i + k] + 3 * I[j + 1, i + k] - I[j + 2, i + k]) > most:
+        if abs(I[j - 1, i + k] - 3 * I[j, i + k] + 3 * I[j + 1, i + k] - I[j + 2, i + k]) > SMOOTH:
             return False
-        if abs(I[j + k, i - 1] - 3 * I[j + k, i] + 3 * I[j + k, i + 1] - I[j + k, i + 2]) > most:
+        if abs(I[j + k, i - 1] - 3 * I[j + k, i] + 3 * I[j + k, i + 1] - I[j + k, i + 2]) > SMOOTH:
             return False
     return True
 
 
 @njit(cache=True, nogil=True)
-def fill_smooth(
-    I: Any, seen: Any, most: float, f: int, j_0: int, j_1: int, weight: float, out: Any, rough: Any
-) -> None:
-    """Add weight x moments of the cells of smooth pixels in rows j_0 to j_1 to `out`; mark the others in `rough`.
-
-    most: largest third difference of transmission over the corners that counts as smooth; a kink that hides below it
-    changes a pixel by a sixteenth of it.
-    """
-    h = 1.0 / f
-    # Mean over cell b of x (1 - x) / 2: what bilinear interpolation between the corners misses per unit of curvature.
-    bow = np.empty(f)
+def bows(f: int) -> Any:
+    """Mean over cell b of x (1 - x) / 2: what bilinear interpolation between the corners misses per unit of
+    curvature."""
+    bow, h = np.empty(f), 1.0 / f
     for b in range(f):
         lo, hi = b * h, (b + 1) * h
         bow[b] = ((hi**2 - lo**2) / 4 - (hi**3 - lo**3) / 6) / h
+    return bow
+
+
+@njit(cache=True, nogil=True)
+def fill_pixel(
+    out: Any,
+    j: int,
+    i: int,
+    f: int,
+    weight: float,
+    bow: Any,
+    f_00: float,
+    f_01: float,
+    f_10: float,
+    f_11: float,
+    I_uu: float,
+    I_vv: float,
+) -> None:
+    """Add weight x the cells of pixel (j, i) from the transmission f_vu at its corners and its curvatures; bow: `bows(f)`."""
+    h = 1.0 / f
+    twist = f_11 - f_10 - f_01 + f_00
+    for a in range(f):
+        y = (a + 0.5) * h
+        for b in range(f):
+            x = (b + 0.5) * h
+            I_u, I_v = f_01 - f_00 + y * twist, f_10 - f_00 + x * twist
+            value = f_00 + x * (f_01 - f_00) + y * I_v - bow[b] * I_uu - bow[a] * I_vv
+            add(
+                out,
+                j * f + a,
+                i * f + b,
+                weight * value,
+                weight * (I_u + (x - 0.5) * I_uu),
+                weight * (I_v + (y - 0.5) * I_vv),
+                weight * twist,
+                weight * I_uu,
+                weight * I_vv,
+            )
+
+
+@njit(cache=True, nogil=True)
+def fill_smooth(I: Any, seen: Any, f: int, j_0: int, j_1: int, weight: float, out: Any, rough: Any) -> None:
+    """Add weight x moments of the cells of smooth pixels in rows j_0 to j_1 to `out`; mark the others in `rough`."""
+    bow = bows(f)
     for j in range(j_0, j_1):
         for i in range(I.shape[1] - 1):
-            rough[j, i] = not _smooth(I, seen, j, i, most)
+            rough[j, i] = not _smooth(I, seen, j, i)
             if rough[j, i]:
                 continue
             if seen[j, i] == 0:
@@ -118,21 +160,4 @@ def fill_smooth(
             f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
             I_uu = 0.25 * (I[j, i - 1] - f_00 - f_01 + I[j, i + 2] + I[j + 1, i - 1] - f_10 - f_11 + I[j + 1, i + 2])
             I_vv = 0.25 * (I[j - 1, i] - f_00 - f_10 + I[j + 2, i] + I[j - 1, i + 1] - f_01 - f_11 + I[j + 2, i + 1])
-            twist = f_11 - f_10 - f_01 + f_00
-            for a in range(f):
-                y = (a + 0.5) * h
-                for b in range(f):
-                    x = (b + 0.5) * h
-                    I_u, I_v = f_01 - f_00 + y * twist, f_10 - f_00 + x * twist
-                    value = f_00 + x * (f_01 - f_00) + y * I_v - bow[b] * I_uu - bow[a] * I_vv
-                    add(
-                        out,
-                        j * f + a,
-                        i * f + b,
-                        weight * value,
-                        weight * (I_u + (x - 0.5) * I_uu),
-                        weight * (I_v + (y - 0.5) * I_vv),
-                        weight * twist,
-                        weight * I_uu,
-                        weight * I_vv,
-                    )
+            fill_pixel(out, j, i, f, weight, bow, f_00, f_01, f_10, f_11, I_uu, I_vv)

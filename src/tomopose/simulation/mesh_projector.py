@@ -21,8 +21,9 @@ from tomopose.simulation.cells import (
     LATTICE_13,
     LATTICE_55,
     LATTICE_233,
-    add,
     add_moments,
+    bows,
+    fill_pixel,
     fill_smooth,
     gather_value,
 )
@@ -32,14 +33,10 @@ from tomopose.simulation.rays import LARGEST, Compiled
 from tomopose.simulation.sampling import kernel_scene, lengths, work_space
 from tomopose.simulation.spectrum import Beam
 from tomopose.simulation.view import View, Window, in_bands
-from tomopose.units import Array
 
-SMOOTH = 1e-3
-"""Largest third difference of transmission over the corners that counts as smooth: the kinks between facets stay below
-it where they matter to nobody."""
 FLAT, STEEP, STEEPEST = 2e-3, 2e-2, 0.1
-"""How far the transmission over a pixel may lie from the bilinear one of its corners to count as flat; and to be sampled
-on the second and on the third lattice."""
+"""How far the transmission over a pixel may lie from the bilinear one of its corners to count as flat; and from where
+on the second and the third lattice are used."""
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -100,6 +97,7 @@ def _rough_cells(
 ) -> None:
     """Add weight x moments of the cells of rough pixels in rows j_0 to j_1 to `out`."""
     work, h = work_space(c, depth), 1.0 / f
+    bow = bows(f)
     Q, L, M = np.empty(len(work[2])), np.empty(len(work[2])), np.empty(HELD)
     most = 1
     for j in range(j_0, j_1):
@@ -122,14 +120,8 @@ def _rough_cells(
                 value -= (1 - y) * ((1 - x) * f_00 + x * f_01) + y * ((1 - x) * f_10 + x * f_11)
                 off, bump = max(off, abs(value)), bump + value / 5
             if off < FLAT:
-                twist = f_11 - f_10 - f_01 + f_00
-                for a in range(f):
-                    y = (a + 0.5) * h
-                    for b in range(f):
-                        x = (b + 0.5) * h
-                        s_u, s_v = f_01 - f_00 + y * twist, f_10 - f_00 + x * twist
-                        m = f_00 + x * (f_01 - f_00) + y * s_v + bump
-                        add(out, j * f + a, i * f + b, weight * m, weight * s_u, weight * s_v, weight * twist, 0.0, 0.0)
+                # The mean of x (1 - x) / 2 is 1 / 12.
+                fill_pixel(out, j, i, f, weight, bow, f_00, f_01, f_10, f_11, -6 * bump, -6 * bump)
                 continue
             points = LATTICE_13 if off < STEEP else LATTICE_55 if off < STEEPEST else LATTICE_233
             n, xy = len(points), (points[:, 0] * points[:, 1]).mean()
@@ -181,7 +173,7 @@ def add_mesh_transmission(
     in_bands(corners, n_v + 1, threads)
     if not fine[0]:
         raise InputError(f"a ray crosses more than {LARGEST} surfaces of one solid; split the solid in several")
-    in_bands(lambda lo, hi: fill_smooth(I, seen, SMOOTH, f, lo, hi, weight, out, rough), n_v, threads)
+    in_bands(lambda lo, hi: fill_smooth(I, seen, f, lo, hi, weight, out, rough), n_v, threads)
     count, start = np.zeros((n_v, n_u), dtype=np.int64), np.zeros((n_v, n_u), dtype=np.int64)
     nothing = np.empty(0, dtype=np.int64)
     in_bands(lambda lo, hi: touching(P, rough, lo, hi, count, start, nothing), n_v, threads)

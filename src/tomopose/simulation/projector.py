@@ -18,9 +18,19 @@ from numba import njit
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.simulation.cells import HELD, LATTICE_5, LATTICE_13, add, add_moments, fill_smooth, gather_value
+from tomopose.simulation.cells import (
+    HELD,
+    LATTICE_5,
+    LATTICE_13,
+    add,
+    add_moments,
+    bows,
+    fill_pixel,
+    fill_smooth,
+    gather_value,
+)
 from tomopose.simulation.rays import LARGEST, Compiled
-from tomopose.simulation.sampling import BLOCK, all_corners, at, coarse_corners, kernel_scene, work_space
+from tomopose.simulation.sampling import BLOCK, all_corners, at, coarse_corners, kernel_scene, lengths, work_space
 from tomopose.simulation.spectrum import Beam
 from tomopose.simulation.view import View, Window, in_bands
 from tomopose.units import Array
@@ -30,8 +40,6 @@ FLAT = 2e-3
 an edge is cut exactly."""
 HALVINGS = 9
 GAUSS = np.stack([(np.polynomial.legendre.leggauss(4)[0] + 1) / 2, np.polynomial.legendre.leggauss(4)[1] / 2], axis=1)
-SMOOTH = 2e-4
-"""Largest third difference of transmission over the corners that counts as smooth."""
 SMALL_PX = 8.0
 """Where a primitive is thinner than this (half its side, px), every ray is cast."""
 
@@ -42,8 +50,7 @@ def _crossing(c: Any, work: Any, u_0: float, v_0: float, u_1: float, v_1: float,
     lo, hi = 0.0, 1.0
     for _ in range(HALVINGS):
         x = 0.5 * (lo + hi)
-        _, here = at(c, work, u_0 + x * (u_1 - u_0), v_0 + x * (v_1 - v_0))
-        if here == mark:
+        if lengths(c, work, u_0 + x * (u_1 - u_0), v_0 + x * (v_1 - v_0)) == mark:
             lo = x
         else:
             hi = x
@@ -56,9 +63,9 @@ def _split_cell(
 ) -> None:
     """Gather in M the moments of a cell that a steep edge crosses.
 
-    x runs across the edge (along u or v), y along it; marks: signatures of the corners, m_xy.  The cell is cut at the y where
-    the edge leaves it sideways, if it does; on Gauss's lines in y the edge's place is found by halving, and both sides
-    are integrated by Gauss's rule in the root of the distance from the edge, where a round rim is smooth.
+    x runs across the edge (along u or v), y along it; marks: signatures of the corners, m_xy.  The cell is cut at the
+    y where the edge leaves it sideways, if it does; on Gauss's lines in y the edge's place is found by halving, and
+    both sides are integrated by Gauss's rule in the root of the distance from the edge, where a round rim is smooth.
     """
     m_00, m_10, m_01, m_11 = marks
     u_x, v_x, u_y, v_y = (h, 0.0, 0.0, h) if along_u else (0.0, h, h, 0.0)
@@ -111,13 +118,22 @@ def _cells(
     """Add weight x moments of the f x f cells of the pixels in rows j_0 to j_1 to `out` (HELD, rows, columns)."""
     work = work_space(c, depth)
     node, node_seen = np.empty((f + 1, f + 1)), np.empty((f + 1, f + 1), dtype=np.int64)
-    h, M = 1.0 / f, np.empty(HELD)
-    fill_smooth(I, seen, SMOOTH, f, j_0, j_1, weight, out, rough)
+    h, M, bow = 1.0 / f, np.empty(HELD), bows(f)
+    fill_smooth(I, seen, f, j_0, j_1, weight, out, rough)
     for j in range(j_0, j_1):
         for i in range(I.shape[1] - 1):
             if not rough[j, i]:
                 continue
             left, low = u_0 + i - 0.5, v_0 + j - 0.5
+            f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
+            mark = seen[j, i]
+            if mark == seen[j, i + 1] and mark == seen[j + 1, i] and mark == seen[j + 1, i + 1]:
+                middle, here = at(c, work, left + 0.5, low + 0.5)
+                off = middle - (f_00 + f_01 + f_10 + f_11) / 4
+                if here == mark and abs(off) < FLAT / 2:
+                    # A neighbour meets the edge.  The middle tells the sum of the curvatures alone.
+                    fill_pixel(out, j, i, f, weight, bow, f_00, f_01, f_10, f_11, -4 * off, -4 * off)
+                    continue
             for a in range(f + 1):
                 for b in range(f + 1):
                     if a in (0, f) and b in (0, f):

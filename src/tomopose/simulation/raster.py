@@ -22,7 +22,6 @@ from tomopose.simulation.mesh import Mesh, MeshSolid
 from tomopose.simulation.view import View, Window, in_bands
 from tomopose.units import Array
 
-
 ROOM = 1e-6
 """px; far more than an edge's place is rounded by."""
 
