@@ -1,4 +1,4 @@
-"""Grey-value pictures as PNG, in the page of the format's own specification (ISO/IEC 15948, 8-bit greyscale)."""
+"""Pictures as PNG, in the page of the format's own specification (ISO/IEC 15948): 8-bit greyscale, or 8-bit colours."""
 
 from __future__ import annotations
 
@@ -34,10 +34,23 @@ def grey_png(rows: np.ndarray) -> bytes:
     """PNG of 8-bit grey values (height, width), first row at the top."""
     if rows.ndim != 2 or rows.dtype != np.uint8 or rows.size == 0:
         raise ShapeError(f"a grey picture is a filled (height, width) array of uint8; got {rows.shape} {rows.dtype}")
-    height, width = rows.shape
-    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return _png(rows, kind=0)
+
+
+def colour_png(rows: np.ndarray) -> bytes:
+    """PNG of 8-bit red, green and blue (height, width, 3), first row at the top."""
+    if rows.ndim != 3 or rows.shape[2] != 3 or rows.dtype != np.uint8 or rows.size == 0:
+        raise ShapeError(
+            f"a colour picture is a filled (height, width, 3) array of uint8; got {rows.shape} {rows.dtype}"
+        )
+    return _png(rows, kind=2)
+
+
+def _png(rows: np.ndarray, *, kind: int) -> bytes:
+    height, width = rows.shape[:2]
+    header = struct.pack(">IIBBBBB", width, height, 8, kind, 0, 0, 0)
     # Each line begins with the number of its filter: 0, none.
-    lines = np.hstack([np.zeros((height, 1), dtype=np.uint8), rows]).tobytes()
+    lines = np.hstack([np.zeros((height, 1), dtype=np.uint8), rows.reshape(height, -1)]).tobytes()
     return SIGNATURE + _chunk(b"IHDR", header) + _chunk(b"IDAT", zlib.compress(lines, 9)) + _chunk(b"IEND", b"")
 
 

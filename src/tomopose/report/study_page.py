@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from tomopose.errors import EngineMissingError
 from tomopose.files import atomic_file
@@ -16,6 +20,8 @@ from tomopose.report.words import number
 COLUMNS = ("quantity", "unit", "printed", "by the paper's method", "by our best", "where, and notes")
 ABSENT = "–"
 DPI = 150
+USUAL_HEIGHT = 420
+"""Of a figure on the page, px; a taller one is drawn taller."""
 MATPLOTLIB = "pip install matplotlib"
 
 
@@ -110,6 +116,44 @@ def _text(value: Any) -> str:
     return str(value.get("text", "")) if isinstance(value, Mapping) else str(value or "")
 
 
+def _colours(scale: Any) -> Any:
+    """A colour map of plotly's as matplotlib's: (place, "rgb(r,g,b)" or "#rrggbb") pairs; None for the default."""
+    if scale is None:
+        return None
+    from matplotlib.colors import LinearSegmentedColormap
+
+    def colour(text: str) -> Any:
+        if not text.startswith("rgb("):
+            return text
+        return tuple(int(part) / 255 for part in text[4:-1].split(","))
+
+    return LinearSegmentedColormap.from_list("scale", [(place, colour(text)) for place, text in scale])
+
+
+def _decorate(ax: Any, plan: Mapping[str, Any]) -> None:
+    """Embedded pictures, words and shape of a plotly layout."""
+    from matplotlib import image
+
+    for place in plan.get("images", ()):
+        png = base64.b64decode(str(place["source"]).split(",", 1)[1])
+        left, top = place["x"], place["y"]
+        ax.imshow(image.imread(io.BytesIO(png), format="png"), aspect="auto", zorder=0, interpolation="antialiased",
+                  extent=(left, left + place["sizex"], top - place["sizey"], top))
+    for words in plan.get("annotations", ()):
+        text = str(words["text"]).replace("<br>", "\n")
+        ax.text(words["x"], words["y"], text, ha="center", va="bottom", fontsize=10)
+    for letter in "xy":
+        axis = plan.get(f"{letter}axis", {})
+        if "range" in axis:
+            getattr(ax, f"set_{letter}lim")(axis["range"])
+        if axis.get("visible") is False:
+            getattr(ax, f"{letter}axis").set_visible(False)
+            for side in ("left", "right") if letter == "y" else ("top", "bottom"):
+                ax.spines[side].set_visible(False)
+    if "scaleanchor" in plan.get("yaxis", {}):
+        ax.set_aspect("equal")
+
+
 def _draw(ax: Any, trace: Mapping[str, Any], k: int, n: int) -> None:
     """One trace; bars stand side by side, this one the k-th of n."""
     kind, name = trace["type"], str(trace.get("name", ""))
@@ -129,9 +173,11 @@ def _draw(ax: Any, trace: Mapping[str, Any], k: int, n: int) -> None:
                **shown)
         ax.set_xticks(list(x), [str(t) for t in trace["x"]], rotation=20, ha="right")
     elif kind == "heatmap":
-        picture = ax.pcolormesh(trace["x"], trace["y"], trace["z"], vmin=trace.get("zmin"), vmax=trace.get("zmax"),
-                                shading="nearest")
-        ax.figure.colorbar(picture, ax=ax, label=_text(trace.get("colorbar", {}).get("title")))
+        values = np.array([[np.nan if v is None else v for v in line] for line in trace["z"]], dtype=np.float64)
+        picture = ax.pcolormesh(trace["x"], trace["y"], values, vmin=trace.get("zmin"), vmax=trace.get("zmax"),
+                                shading="nearest", cmap=_colours(trace.get("colorscale")))
+        if trace.get("showscale", True):
+            ax.figure.colorbar(picture, ax=ax, label=_text(trace.get("colorbar", {}).get("title")))
     else:
         raise ValueError(f"a trace of type {kind!r} cannot be drawn")
 
@@ -143,7 +189,9 @@ def figure_png(path: str | Path, figure: Figure) -> None:
     """
     plt = _pyplot()
     solid = any(t["type"] == "scatter3d" for t in figure.data)
-    fig = plt.figure(figsize=(8, 6 if solid else 4.5), layout="constrained")
+    equal = "scaleanchor" in figure.layout.get("yaxis", {})
+    height = 6.0 if solid else 4.5 * max(figure.height / USUAL_HEIGHT, 1.0)
+    fig = plt.figure(figsize=(8, height), layout="constrained")
     try:
         ax = fig.add_subplot(projection="3d" if solid else None)
         bars = [t for t in figure.data if t["type"] == "bar"]
@@ -155,6 +203,8 @@ def figure_png(path: str | Path, figure: Figure) -> None:
             getattr(ax, f"set_{letter}label")(_text(axis.get("title")).replace("<sub>", "_").replace("</sub>", ""))
             if axis.get("type") == "log":
                 getattr(ax, f"set_{letter}scale")("log")
+        if not solid:
+            _decorate(ax, figure.layout)
         if solid:
             ax.set_aspect("equal")
             ax.locator_params(axis="z", nbins=3)
@@ -162,6 +212,6 @@ def figure_png(path: str | Path, figure: Figure) -> None:
         if ax.get_legend_handles_labels()[1]:
             ax.legend(fontsize=8)
         with atomic_file(path) as temporary:
-            fig.savefig(temporary, dpi=DPI, format="png")
+            fig.savefig(temporary, dpi=DPI, format="png", bbox_inches="tight" if equal else None)
     finally:
         plt.close(fig)

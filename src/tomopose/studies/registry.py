@@ -21,6 +21,7 @@ PAPER: Mapping[str, str] = MappingProxyType(
         "figure8": "Fig. 8",
         "figure9": "Fig. 9",
         "tuy": "Sec. 6.3",
+        "section6": "Figs. 11 to 16",
         "cylinder": "Fig. 12, in principle",
         "improvements": "Sec. 7",
     }
