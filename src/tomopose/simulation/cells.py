@@ -121,7 +121,10 @@ def fill_pixel(
     I_uu: float,
     I_vv: float,
 ) -> None:
-    """Add weight x the cells of pixel (j, i) from the transmission f_vu at its corners and its curvatures; bow: `bows(f)`."""
+    """Add weight x the cells of pixel (j, i) from f_vu, the transmission at its corners, and its curvatures.
+
+    bow: `bows(f)`.
+    """
     h = 1.0 / f
     twist = f_11 - f_10 - f_01 + f_00
     for a in range(f):

@@ -13,12 +13,18 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from scipy import ndimage
 
 from tomopose.errors import InputError
 from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 from tomopose.simulation.effects import MTF, Glare, Scatter
-from tomopose.simulation.noise import add_normal_noise, add_photon_noise, digitise, frame_key
+from tomopose.simulation.noise import (
+    add_normal_noise,
+    add_photon_noise,
+    digitise,
+    frame_key,
+    spread_columns,
+    spread_rows,
+)
 from tomopose.simulation.view import in_bands
 from tomopose.units import Array
 
@@ -141,28 +147,34 @@ def fixed_pattern(detector: Detector, shape: tuple[int, int], seed: int) -> tupl
     return np.maximum(gain, 0.0), dark, rng.random(shape) < detector.dead_share
 
 
-def _raw(signal: Array, detector: Detector, *, seed: int, frame: int, stream: int, threads: int) -> Array:
+def counted(signal: Array, detector: Detector, *, key: Any, threads: int) -> Array:
+    """Quanta (n_v, n_u) that a pixel reads, float32: Poisson numbers about signal x quanta, spread by the
+    scintillator."""
+    n_v = signal.shape[0]
+    mean, quanta = signal * detector.quanta, np.empty(signal.shape, dtype=np.float32)
+    in_bands(lambda lo, hi: add_photon_noise(mean, key, lo, hi, quanta), n_v, threads)
+    if detector.noise_sigma > 0:
+        k, rows = detector.noise_kernel.astype(np.float32), np.empty_like(quanta)
+        np.subtract(quanta, mean, out=quanta, casting="same_kind")
+        in_bands(lambda lo, hi: spread_rows(quanta, k, lo, hi, rows), n_v, threads)
+        in_bands(lambda lo, hi: spread_columns(rows, k, mean, lo, hi, quanta), n_v, threads)
+    return quanta
+
+
+def _raw(signal: Array, detector: Detector, *, seed: int, frame: int, threads: int) -> Array:
     """Grey values before rounding: quanta, their spread, gain, dark, readout noise."""
     n_v = signal.shape[0]
     gain, dark, _ = (
         fixed_pattern(detector, signal.shape, seed) if detector.patterned or detector.dead_share else (1, 0, 0)
     )
     if math.isinf(detector.snr):
-        quanta = signal
-        scale = detector.white
+        quanta, scale = signal, detector.white
     else:
-        mean, quanta = signal * detector.quanta, np.empty(signal.shape, dtype=np.float32)
-        key = frame_key(seed, frame, stream)
-        in_bands(lambda lo, hi: add_photon_noise(mean, key, lo, hi, quanta), n_v, threads)
+        quanta = counted(signal, detector, key=frame_key(seed, frame), threads=threads)
         scale = detector.white / detector.quanta
-        if detector.noise_sigma > 0:
-            deviation, k = quanta - mean, detector.noise_kernel
-            quanta = mean + ndimage.correlate1d(
-                ndimage.correlate1d(deviation, k, 0, mode="mirror"), k, 1, mode="mirror"
-            )
-    raw = dark + gain * (scale * quanta)
+    raw = dark + gain * (scale * quanta.astype(np.float64))
     if detector.readout_noise > 0:
-        sigma, key = detector.readout_noise / math.sqrt(detector.averages), frame_key(seed, frame, stream + 8)
+        sigma, key = detector.readout_noise / math.sqrt(detector.averages), frame_key(seed, frame, 8)
         in_bands(lambda lo, hi: add_normal_noise(raw, sigma, key, lo, hi), n_v, threads)
     return np.asarray(raw)
 
@@ -193,19 +205,13 @@ def expose(T: Array, detector: Detector, scanner: Scanner, *, seed: int, frame: 
     """Grey values, uint16, of a noiseless image (n_v, n_u), given as a share of the empty beam."""
     n_v = T.shape[0]
     out = np.empty(T.shape, dtype=np.uint16)
-    simple = not (detector.patterned or detector.dead_share or detector.readout_noise or detector.noise_sigma)
-    if simple and not math.isinf(detector.snr):
-        quanta, key = detector.quanta, frame_key(seed, frame)
-        signal, mean = np.empty(T.shape, dtype=np.float32), T * quanta
-
-        def work(lo: int, hi: int) -> None:
-            add_photon_noise(mean, key, lo, hi, signal)
-            digitise(signal, detector.white / quanta, 0.0, detector.top, lo, hi, out)
-
-        in_bands(work, n_v, threads)
+    if not (detector.patterned or detector.dead_share or detector.readout_noise or math.isinf(detector.snr)):
+        quanta = counted(T, detector, key=frame_key(seed, frame), threads=threads)
+        gain = detector.white / detector.quanta
+        in_bands(lambda lo, hi: digitise(quanta, gain, 0.0, detector.top, lo, hi, out), n_v, threads)
         return out
     profile = beam_profile(scanner, detector)
-    raw = _raw(T if profile is None else T * profile, detector, seed=seed, frame=frame, stream=0, threads=threads)
+    raw = _raw(T if profile is None else T * profile, detector, seed=seed, frame=frame, threads=threads)
     dead = fixed_pattern(detector, T.shape, seed)[2] if detector.dead_share else None
     if dead is not None:
         raw[dead] = 0.0

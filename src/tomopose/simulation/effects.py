@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numba import njit
 from scipy import fft, ndimage
 
 from tomopose.errors import InputError
@@ -42,37 +43,73 @@ class Glare:
             raise InputError(f"glare: share {self.share}, sigma {self.sigma} px; share lies in [0, 1), sigma above 0")
 
 
-def wide_blur(image: Array, sigma: float) -> Array:
-    """Gaussian blur of a wide sigma (px): on an image averaged over blocks, interpolated back."""
-    step = max(1, int(sigma / 4))
+@njit(cache=True, nogil=True)
+def _block_means(image: Any, step: int, potential: bool, out: Any) -> None:
+    """Means of step x step pixels of T, or of its scatter potential -T ln T."""
     n_v, n_u = image.shape
-    pad = ((0, -n_v % step), (0, -n_u % step))
-    padded = np.pad(image, pad, mode="edge")
-    small = padded.reshape(padded.shape[0] // step, step, padded.shape[1] // step, step).mean(axis=(1, 3))
+    for j in range(out.shape[0]):
+        v_0, v_1 = j * step, min((j + 1) * step, n_v)
+        for i in range(out.shape[1]):
+            u_0, u_1 = i * step, min((i + 1) * step, n_u)
+            total = 0.0
+            for v in range(v_0, v_1):
+                for u in range(u_0, u_1):
+                    T = image[v, u]
+                    if not potential:
+                        total += T
+                    elif T != 1.0 and T > 1e-30:
+                        total -= T * np.log(T)
+            out[j, i] = total / ((v_1 - v_0) * (u_1 - u_0))
+
+
+@njit(cache=True, nogil=True)
+def _joined(image: Any, small: Any, step: int, own: float, share: float, constant: float) -> Any:
+    """own x image + share x the block means, interpolated between the blocks' middles, + constant."""
+    n_v, n_u = image.shape
+    out = np.empty(image.shape)
+    for v in range(n_v):
+        y = min(max((v + 0.5) / step - 0.5, 0.0), small.shape[0] - 1.0)
+        j = min(int(y), max(small.shape[0] - 2, 0))
+        j_1, y = min(j + 1, small.shape[0] - 1), y - j
+        for u in range(n_u):
+            x = min(max((u + 0.5) / step - 0.5, 0.0), small.shape[1] - 1.0)
+            i = min(int(x), max(small.shape[1] - 2, 0))
+            i_1, x = min(i + 1, small.shape[1] - 1), x - i
+            low = small[j, i] + x * (small[j, i_1] - small[j, i])
+            high = small[j_1, i] + x * (small[j_1, i_1] - small[j_1, i])
+            out[v, u] = own * image[v, u] + share * (low + y * (high - low)) + constant
+    return out
+
+
+def _spread(image: Array, sigma: float, *, potential: bool, own: float, share: float, constant: float = 0.0) -> Array:
+    """own x image + share x (the image, or its scatter potential, blurred by a wide sigma, px) + constant.
+
+    The wide blur acts on means over blocks of a quarter of sigma, interpolated back.
+    """
+    step = max(1, int(sigma / 4))
+    small = np.empty((-(-image.shape[0] // step), -(-image.shape[1] // step)))
+    _block_means(image, step, potential, small)
     small = ndimage.gaussian_filter(small, sigma / step, mode="nearest")
-    v = np.clip((np.arange(n_v) + 0.5) / step - 0.5, 0, small.shape[0] - 1)
-    u = np.clip((np.arange(n_u) + 0.5) / step - 0.5, 0, small.shape[1] - 1)
-    rows = _interpolate(small, v)
-    return _interpolate(rows.T, u).T
+    return np.asarray(_joined(image, small, step, own, share, constant))
 
 
-def _interpolate(a: Array, x: Array) -> Array:
-    k = np.minimum(x.astype(np.intp), max(len(a) - 2, 0))
-    upper = np.minimum(k + 1, len(a) - 1)
-    w = (x - k)[:, None]
-    return np.asarray(a[k] * (1 - w) + a[upper] * w)
+def wide_blur(image: Array, sigma: float) -> Array:
+    """Gaussian blur of a wide sigma (px)."""
+    return _spread(image, sigma, potential=False, own=0.0, share=1.0)
 
 
 def with_scatter(T: Array, scatter: Scatter) -> Array:
     """Primary plus scattered radiation."""
     if scatter.amount > 0:
-        T = T + scatter.amount * wide_blur(-T * np.log(np.maximum(T, 1e-30)), scatter.sigma)
+        return _spread(
+            T, scatter.sigma, potential=True, own=1.0, share=scatter.amount, constant=scatter.constant
+        )
     return T + scatter.constant if scatter.constant > 0 else T
 
 
 def with_glare(T: Array, glare: Glare) -> Array:
     """The image with a veil over it; an even image stays as it is."""
-    return (1 - glare.share) * T + glare.share * wide_blur(T, glare.sigma) if glare.share > 0 else T
+    return _spread(T, glare.sigma, potential=False, own=1 - glare.share, share=glare.share) if glare.share > 0 else T
 
 
 @dataclass(frozen=True, kw_only=True)

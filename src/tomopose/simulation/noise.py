@@ -93,3 +93,40 @@ def digitise(signal: Any, gain: float, offset: float, top: float, v_0: int, v_1:
         for u in range(signal.shape[1]):
             g = offset + gain * signal[v, u] + 0.5
             out[v, u] = 0 if g < 0 else (top if g > top else np.uint16(g))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _mirrored(k: int, n: int) -> int:
+    """Index k of n, reflected about the first and the last element."""
+    k = -k if k < 0 else k
+    return max(2 * (n - 1) - k, 0) if k > n - 1 else k
+
+
+@njit(cache=True, nogil=True)
+def spread_rows(image: Any, k: Any, v_0: int, v_1: int, out: Any) -> None:
+    """Rows v_0 to v_1 of an image correlated with the odd kernel k along v, float32."""
+    n_v, n_u = image.shape
+    half = len(k) // 2
+    for v in range(v_0, v_1):
+        out[v, :] = np.float32(0.0)
+        for a in range(len(k)):
+            row, weight = _mirrored(v + a - half, n_v), k[a]
+            for u in range(n_u):
+                out[v, u] += weight * image[row, u]
+
+
+@njit(cache=True, nogil=True)
+def spread_columns(image: Any, k: Any, mean: Any, v_0: int, v_1: int, out: Any) -> None:
+    """mean + an image correlated with the odd kernel k along u, rows v_0 to v_1."""
+    n_u = image.shape[1]
+    half = len(k) // 2
+    for v in range(v_0, v_1):
+        for u in range(n_u):
+            total = np.float32(0.0)
+            if half <= u < n_u - half:
+                for a in range(len(k)):
+                    total += k[a] * image[v, u + a - half]
+            else:
+                for a in range(len(k)):
+                    total += k[a] * image[v, _mirrored(u + a - half, n_u)]
+            out[v, u] = mean[v, u] + total

@@ -20,8 +20,11 @@ from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.simulation.crossings import crossings
 from tomopose.simulation.shapes import Joined, Primitive, Shape, Solid
+from tomopose.simulation.view import in_bands
 from tomopose.units import Array
 
+BUNDLE = 32
+"""Rays that are looked at together, to find which solids they can meet at all."""
 LARGEST = 48
 """Most surface crossings on one ray inside one solid; a ray that needs more is an error, never a wrong path."""
 
@@ -233,6 +236,33 @@ def trace(
 
 
 @njit(cache=True, nogil=True)
+def _meet(centre: Any, radius: Any, o: Any, d: Any, active: Any) -> None:
+    """Mark the solids that a bundle of rays can meet.
+
+    Rays within the angle a of an axis pass a point at distance e from their origin, p from the axis, no nearer than
+    p cos(a) - e sin(a).
+    """
+    active[:] = True
+    x = y = z = 0.0
+    for i in range(len(d)):
+        if o[i, 0] != o[0, 0] or o[i, 1] != o[0, 1] or o[i, 2] != o[0, 2]:
+            return
+        x, y, z = x + d[i, 0], y + d[i, 1], z + d[i, 2]
+    length = np.sqrt(x * x + y * y + z * z)
+    if length < 0.5 * len(d):
+        return
+    x, y, z = x / length, y / length, z / length
+    cosine = 1.0
+    for i in range(len(d)):
+        cosine = min(cosine, x * d[i, 0] + y * d[i, 1] + z * d[i, 2])
+    sine = np.sqrt(max(1 - cosine * cosine, 0.0)) + 1e-9
+    for k in range(len(centre)):
+        ex, ey, ez = centre[k, 0] - o[0, 0], centre[k, 1] - o[0, 1], centre[k, 2] - o[0, 2]
+        along, square = ex * x + ey * y + ez * z, ex * ex + ey * ey + ez * ez
+        active[k] = np.sqrt(max(square - along * along, 0.0)) * cosine - np.sqrt(square) * sine <= radius[k] + 1e-6
+
+
+@njit(cache=True, nogil=True)
 def _trace_all(
     kind: Any,
     p: Any,
@@ -246,11 +276,16 @@ def _trace_all(
     o: Any,
     d: Any,
     depth: int,
+    lo: int,
+    hi: int,
     L: Any,
 ) -> int:
+    """Path lengths of rays lo to hi into L; returns the number of a ray whose list overflowed, or -1."""
     T, S = np.empty((depth + 3, LARGEST)), np.empty((depth + 3, LARGEST + 1), dtype=np.int64)
     active = np.ones(len(material), dtype=np.bool_)
-    for i in range(len(d)):
+    for i in range(lo, hi):
+        if (i - lo) % BUNDLE == 0:
+            _meet(centre, radius, o[i : min(i + BUNDLE, hi)], d[i : min(i + BUNDLE, hi)], active)
         if (
             trace(
                 kind,
@@ -280,34 +315,34 @@ def _trace_all(
 
 
 def path_lengths(
-    solids: Compiled | list[Solid], o: Any, d: Any, T_FW: dict[Frame, RigidTransform] | None = None
+    solids: Compiled | list[Solid],
+    o: Any,
+    d: Any,
+    T_FW: dict[Frame, RigidTransform] | None = None,
+    *,
+    threads: int = 1,
 ) -> Array:
     """Path lengths (n, m), mm, of rays in each of the m materials.
 
     o: origins (n, 3) or (3,), mm; d: directions (n, 3), any length; both in W, or, where T_FW is None, in the frame
-    that all solids share.  Only the ray's part in front of its origin counts.
+    that all solids share.  Only the ray's part in front of its origin counts.  Neighbours in the list that are
+    neighbours in space are traced faster.
     """
     compiled = solids if isinstance(solids, Compiled) else compile_solids(solids)
     R, t, centre = (compiled.R, compiled.t, compiled.centre) if T_FW is None else compiled.in_world(T_FW)
-    d = np.ascontiguousarray(np.atleast_2d(np.asarray(d, dtype=np.float64)))
-    d = d / np.linalg.norm(d, axis=1, keepdims=True)
-    o = np.ascontiguousarray(np.broadcast_to(np.asarray(o, dtype=np.float64), d.shape))
+    d = np.atleast_2d(np.asarray(d, dtype=np.float64))
+    d = np.ascontiguousarray(d / np.sqrt(np.einsum("ij,ij->i", d, d))[:, None])
+    o = np.broadcast_to(np.asarray(o, dtype=np.float64), d.shape)
     L = np.zeros((len(d), len(compiled.materials)))
-    bad = _trace_all(
-        compiled.kind,
-        compiled.p,
-        R,
-        t,
-        compiled.ops,
-        compiled.first,
-        compiled.material,
-        centre,
-        compiled.radius,
-        o,
-        d,
-        compiled.depth,
-        L,
-    )
-    if bad >= 0:
-        raise InputError(f"ray {bad} crosses more than {LARGEST} surfaces of one solid; split the solid in several")
+    scene = (compiled.kind, compiled.p, R, t, compiled.ops, compiled.first, compiled.material, centre, compiled.radius)
+    bad = [-1]
+
+    def some(lo: int, hi: int) -> None:
+        found = _trace_all(*scene, o, d, compiled.depth, lo, hi, L)
+        if found >= 0:
+            bad[0] = found
+
+    in_bands(some, len(d), threads)
+    if bad[0] >= 0:
+        raise InputError(f"ray {bad[0]} crosses more than {LARGEST} surfaces of one solid; split the solid in several")
     return L
