@@ -1,0 +1,156 @@
+"""Section 6 in pieces: path lengths, radiographs, what is measured, and a tiny run that goes on where it stopped."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tomopose import Scanner
+from tomopose.errors import EngineFailedError
+from tomopose.geometry.frames import Frame
+from tomopose.geometry.projection import eq5_matrices
+from tomopose.geometry.transforms import RigidTransform
+from tomopose.simulation.mesh import MeshSolid
+from tomopose.simulation.mesh import mesh_paths as embree_paths
+from tomopose.simulation.rays import compile_solids, path_lengths
+from tomopose.simulation.specimen import specimen_mesh
+from tomopose.simulation.standard import BASE_TOP, multi_sphere_standard, sphere_centres, sphere_diameters
+from tomopose.studies import section6
+from tomopose.studies.demo import demo_setup
+from tomopose.studies.section6_paths import ball_paths, fine_matrices, mesh_paths
+from tomopose.studies.section6_scan import MOUNTED, WHITE, Numbers, Radiographs, grid_of, scan_with, specimen
+from tomopose.studies.section6_specimen import cylinder_areas, reference, true_lengths, unseen_by_circle
+from tomopose.studies.section6_tables import MPE_A_UM, limit, verdict, waves
+from tomopose.studies.section6_volumes import cases_of
+from tomopose.studies.steps import Steps
+from tomopose.trajectory.completeness import source_path
+from tomopose.trajectory.scan import tilted_scan
+from tomopose.trajectory.tilt import eq11_triangle
+
+SCANNER = Scanner(d_SD=1200.0, d_SR=310.0, p_u=2.0, p_v=2.5, u_0=70.3, v_0=66.8, n_u=151, n_v=123)
+TINY = Numbers(
+    binning={"specimen": 14, "standard": 11}, views={"specimen": 63, "standard": 42},
+    runs={"specimen": (1,), "standard": (1,)}, edge=2.0, samples=1, radiographs=False,
+)
+
+
+def views(n: int = 3) -> np.ndarray:
+    scan = tilted_scan(n, eq11_triangle)
+    return eq5_matrices(SCANNER, T_HT=demo_setup().T_HT, T_MH=scan.T_MH, alpha=scan.alpha)
+
+
+def rays(P: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    inverse = np.linalg.inv(P[:, :3])
+    u, v = np.meshgrid(np.arange(SCANNER.n_u), np.arange(SCANNER.n_v))
+    d = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ inverse.T
+    return -inverse @ P[:, 3], d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def test_paths_through_a_mesh_are_those_of_the_ray_tracer():
+    mesh = specimen_mesh(edge=2.0, segments=60)
+    for P in views():
+        found = mesh_paths(P, mesh.vertices, mesh.faces, SCANNER.n_u, SCANNER.n_v)
+        expected = embree_paths(MeshSolid(mesh=mesh, material="Al"), *rays(P)).reshape(found.shape)
+        assert found.max() > 25.0
+        np.testing.assert_allclose(found, expected, atol=1e-6)  # mm
+
+
+def test_a_mirrored_view_has_the_same_paths():
+    mesh = specimen_mesh(edge=2.0, segments=60)
+    P = views(1)[0]
+    mirrored = np.diag([-1.0, 1.0, 1.0]) @ P + np.outer([SCANNER.n_u - 1, 0, 0], P[2])
+    found = [mesh_paths(p, mesh.vertices, mesh.faces, SCANNER.n_u, SCANNER.n_v) for p in (P, mirrored)]
+    np.testing.assert_allclose(found[1][:, ::-1], found[0], atol=1e-6)
+
+
+def test_a_mesh_with_a_hole_is_refused():
+    mesh = specimen_mesh(edge=2.0, segments=60)
+    with pytest.raises(EngineFailedError, match="hole"):
+        mesh_paths(views(1)[0], mesh.vertices, mesh.faces[: len(mesh.faces) // 2], SCANNER.n_u, SCANNER.n_v)
+
+
+def test_paths_through_balls_on_shafts_are_those_of_the_solids():
+    solids = compile_solids(multi_sphere_standard(base=False))
+    bottom = np.full(27, BASE_TOP)
+    for P in views():
+        source, d = rays(P)
+        expected = path_lengths(solids, source, d, {Frame.M: RigidTransform.identity(Frame.M, Frame.W)}).sum(axis=1)
+        found = ball_paths(P, sphere_centres(), sphere_diameters() / 2, 1.0, bottom, SCANNER.n_u, SCANNER.n_v)
+        np.testing.assert_allclose(found.ravel(), expected, atol=1e-9)
+
+
+def test_fine_pixels_lie_evenly_within_their_pixel():
+    P = views(1)[0]
+    x = np.array([3.0, -4.0, 5.0, 1.0])
+    coarse, fine = (M @ x for M in (P, fine_matrices(P, 3)))
+    np.testing.assert_allclose(fine[:2] / fine[2], 3 * (coarse[:2] / coarse[2] + 0.5) - 0.5, rtol=1e-12)
+
+
+def test_radiographs_are_the_same_each_time_and_as_noisy_as_said():
+    scan = scan_with("standard", "3D", TINY, 5)
+    images = Radiographs(scan)
+    clear, noisy = images.transmission(2), images[2]
+    np.testing.assert_array_equal(noisy, Radiographs(scan)[2])
+    assert not np.array_equal(noisy, Radiographs(replace(scan, seed=scan.seed + 1))[2])
+    air = clear == 1.0
+    assert np.std(noisy[air] / WHITE) == pytest.approx(1 / (200.0 * 11), rel=0.05)
+    assert np.mean(noisy[air] / WHITE) == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("thing", ["specimen", "standard"])
+def test_the_grid_holds_the_object(thing):
+    grid = grid_of(thing, TINY)
+    x = specimen(TINY.edge).vertices @ MOUNTED.T if thing == "specimen" else sphere_centres()
+    inside = grid.indices(x)
+    assert (inside > 2).all()
+    assert (inside < np.array(grid.shape) - 3).all()
+
+
+def test_true_lengths_differ_from_nominal_ones_by_the_form_only():
+    found = true_lengths(TINY.edge)
+    nominal = {"L1": 4.0, "L2": 5.5, "L3": 7.0, "L4": 8.5, "L5": 10.0, "L6": 12.0, "L7": 10.0}
+    assert found.keys() == nominal.keys()
+    for name, value in found.items():
+        assert 0 < abs(value - nominal[name]) < 0.06  # mm: 8 um of form, over levers
+
+
+def test_a_circle_sees_upright_walls_and_not_what_faces_up():
+    mesh = reference(TINY.edge)
+    source = source_path(scan_with("specimen", "circular", TINY, 5).truth)
+    unseen = unseen_by_circle(mesh, source)
+    assert not unseen[cylinder_areas(mesh)].any()
+    up = (mesh.normals @ MOUNTED.T)[:, 2] > 0.9999
+    far = np.abs((mesh.points @ MOUNTED.T)[:, 2]) > 10.0
+    assert unseen[up & far & ~mesh.on_edge].all()
+
+
+def test_waves_and_verdicts():
+    phi = np.linspace(0, 2 * np.pi, 700, endpoint=False)
+    amplitude = waves(np.where(phi < 0.01, np.nan, 5.0 * np.cos(7 * phi + 0.3)), phi)
+    assert amplitude[7] == pytest.approx(5.0, rel=0.01)
+    assert amplitude[[3, 6, 8, 14]].max() < 0.05
+    assert verdict(10.0, 10.1) == "equal"
+    assert "better" in verdict(10.0, 5.0)
+    assert "WORSE" in verdict(5.0, 10.0)
+    np.testing.assert_allclose(limit([0.0, 50.0]), [MPE_A_UM, MPE_A_UM + 1.0])
+
+
+def test_cases_have_names_of_their_own_and_order_is_looked_at_once():
+    cases = [*cases_of("specimen", (1, 2)), *cases_of("standard", (1, 2))]
+    assert len({c.name for c in cases}) == len(cases) == 6 + 8
+    assert [c.order for c in cases if c.order] == ["sequential", "golden"]
+
+
+def test_a_tiny_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    steps = Steps(folder=tmp_path, key={"study": "section6"})
+    rows, checks, figures, _ = section6.run_with(TINY, 7, steps, lambda done, total: None)
+    wave = next(r for r in rows if r.group.startswith("Fig. 12, 3D") and "seven periods" in r.quantity)
+    assert wave.best < 0.5 * wave.paper_method
+    assert len(figures) == 9
+    assert len({c.statement for c in checks}) == len(checks)
+    monkeypatch.setattr("tomopose.studies.section6_volumes.reconstruct", lambda *a, **k: pytest.fail("made again"))
+    again = section6.run_with(TINY, 7, steps, lambda done, total: None)
+    assert again[0] == rows
+    assert again[1] == checks
