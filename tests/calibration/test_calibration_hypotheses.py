@@ -152,3 +152,37 @@ def test_a_turned_scanner_keeps_the_truth():
     assert cal.d_rms < 1e-9
     np.testing.assert_allclose(cal.t, BALL, atol=1e-8)
     np.testing.assert_allclose(cal.T_HT.t, MOUNT.t * [1, -1, -1], atol=1e-8)
+
+
+TAU = np.linspace(0, 1, len(MIXED))
+COURSES = {"even": TAU, "settling": 1 - np.exp(-3 * TAU), "to and fro": np.sin(4 * TAU), "step": (TAU > 0.5) * 1.0}
+
+
+def drifting(x, course, size, seed):
+    rng = np.random.default_rng(seed)
+    a = rng.uniform(0, 2 * np.pi)
+    noisy = x + rng.normal(0, 0.0146, x.shape) + size * COURSES[course][:, None] * [np.cos(a), np.sin(a)]
+    return BallObservations.from_sigma(noisy, 0.0146, pose_id=MIXED.pose_id)
+
+
+@pytest.mark.parametrize("course", COURSES)
+@pytest.mark.parametrize("size", [0.2, 3.0])
+def test_a_drift_is_not_taken_for_a_wrong_convention(course, size):
+    exact = observe(MIXED, seed=None).x_D
+    for seed in range(3):
+        observed = drifting(exact, course, size, seed)
+        assert diagnose(SCANNER, MIXED, observed).better == ()
+        cal = calibrate(SCANNER, MIXED, observed)
+        assert cal.verdict == "doubtful"
+        assert any("drift" in r or "changed" in r for r in cal.reasons)
+        assert not any("convention fits" in r for r in cal.reasons)
+
+
+@pytest.mark.parametrize("course", COURSES)
+@pytest.mark.parametrize("name", ["sign of UVW", "order ZYX", "pairing lag +1"])
+def test_a_wrong_convention_is_found_under_drift(name, course):
+    poses, x = CASES[name]
+    observed = drifting(x, course, 0.3, 1)
+    better = diagnose(SCANNER, poses, observed).better
+    assert name in {h.name for h in better[:2]}
+    assert calibrate(SCANNER, poses, observed).verdict == "rejected"
