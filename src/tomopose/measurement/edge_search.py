@@ -18,7 +18,7 @@ import numpy as np
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.measurement import edge_kernel as kernel
-from tomopose.measurement.plateaus import neighbour_medians
+from tomopose.measurement.plateaus import shared_plateaus
 from tomopose.measurement.splines import REACH, spline_coefficients
 from tomopose.units import Array, float_array
 from tomopose.volume import Volume
@@ -259,7 +259,7 @@ def _shared(edges: Edges, result: Array, points: Array, normals: Array, unit: fl
     if not rows.size:
         return edges
     own = result[rows][:, [kernel.A, kernel.B]]
-    levels, count = neighbour_medians(points[rows], normals[rows], own, radius * unit)
+    levels, count = shared_plateaus(points[rows], normals[rows], own, radius * unit)
     offset, u = np.array(edges.offset), np.array(edges.u)
     inside, outside = np.array(edges.inside), np.array(edges.outside)
     offset[rows] += unit * np.sum(result[rows][:, [kernel.S_BY_A, kernel.S_BY_B]] * (levels - own), axis=1)

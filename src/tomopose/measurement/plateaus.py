@@ -2,9 +2,9 @@
 
 A step fitted with its plateaus free pays for their noise: over a window of 4 sigma on both sides the place scatters a
 third more than with known plateaus.  Drift of grey values (beam hardening, scatter, cupping) is slow over some voxels,
-so the median of neighbouring edges' plateaus is local enough and far quieter; a mean would be drawn down by the few
-next to an edge of the part.  With plateaus a', b' in place of a, b, the
-normal equations of the fit move the place by
+so the median of neighbouring edges' plateaus is local enough and far quieter.  Next to an edge of the part, where
+plateaus fall within a voxel or two, an edge keeps its own and lends them to none: its neighbours lie on one side.
+With plateaus a', b' in place of a, b, the normal equations of the fit move the place by
 
     ds = -(h_sa (a' - a) + h_sb (b' - b)) / h_ss.
 """
@@ -18,21 +18,35 @@ from numba import njit, prange
 
 from tomopose.units import Array
 
+ONE_SIDED = 0.15
+"""Distance of the neighbours' centroid, as a share of the radius, from which they lie on one side."""
+UNLIKE = 4.0
+"""An edge whose plateau differs from its neighbours' by so many times the usual difference keeps its own."""
 MOST = 400
 """Neighbours looked at; a radius of 3 voxels holds about 60."""
 SAME_SIDE = 0.7
 """Cosine between normals from which two edges look the same way: not the other side of a wall, not round a corner."""
 
 
-def neighbour_medians(points: Array, normals: Array, values: Array, radius: float) -> tuple[Array, Array]:
-    """Medians (n, c) of values (n, c) over the points (n, 3) within radius, mm, that look the same way, own ones
-    included, and how many they are (n,)."""
+def shared_plateaus(points: Array, normals: Array, own: Array, radius: float) -> tuple[Array, Array]:
+    """Plateaus (n, 2) of edges at points (n, 3), mm, shared within radius, mm, and how many share them (n,).
+
+    own: (n, 2) as fitted.  Edges at the rim of their neighbourhood, or unlike their neighbours, keep their own.
+    """
     low = points.min(axis=0) - radius
     cell = np.floor((points - low) / radius).astype(np.int64)
     size = cell.max(axis=0) + 2
     key = (cell[:, 2] * size[1] + cell[:, 1]) * size[0] + cell[:, 0]
     order = np.argsort(key, kind="stable")
-    return _medians(points[order], normals[order], values[order], key[order], size, radius, np.argsort(order))
+    x, n, values, key = points[order], normals[order], own[order], key[order]
+    inner = _inner(x, n, key, size, radius)
+    median, count = _medians(x, n, values, key, size, radius, inner)
+    unlike = np.abs(median - values)
+    usual = 1.4826 * np.median(unlike[inner], axis=0) if inner.any() else np.zeros(2)
+    kept = ~inner | (unlike > UNLIKE * usual).any(axis=1)
+    median[kept], count[kept] = values[kept], 1.0
+    back = np.argsort(order)
+    return median[back], count[back]
 
 
 @njit(cache=True)
@@ -48,28 +62,55 @@ def _first(key: Any, wanted: Any) -> Any:
     return low
 
 
+@njit(cache=True, inline="always")
+def _near(x: Any, n: Any, i: Any, k: Any, radius: Any) -> Any:
+    """Whether point k lies within radius of point i and looks the same way."""
+    square = (x[k, 0] - x[i, 0]) ** 2 + (x[k, 1] - x[i, 1]) ** 2 + (x[k, 2] - x[i, 2]) ** 2
+    return square <= radius * radius and n[k, 0] * n[i, 0] + n[k, 1] * n[i, 1] + n[k, 2] * n[i, 2] >= SAME_SIDE
+
+
 @njit(cache=True, parallel=True)
-def _medians(x: Any, n: Any, values: Any, key: Any, size: Any, radius: Any, place: Any) -> Any:
-    """As `neighbour_medians`, of points sorted by the key of their cell; place: where each original point is now."""
-    m, c = values.shape
-    median, count = np.empty((m, c)), np.empty(m)
-    for o in prange(m):
-        i = place[o]
-        near, found = np.empty((c, MOST)), 0
+def _inner(x: Any, n: Any, key: Any, size: Any, radius: Any) -> Any:
+    """(n,) whether a point's neighbours lie all around it; points are sorted by the key of their cell."""
+    m = x.shape[0]
+    inner = np.zeros(m, dtype=np.bool_)
+    for i in prange(m):
+        total, found = np.zeros(3), 0
         for dz in range(-1, 2):
             for dy in range(-1, 2):
                 # The three cells of a row follow one another.
                 row = key[i] + (dz * size[1] + dy) * size[0]
                 k = _first(key, row - 1)
+                while k < m and key[k] <= row + 1:
+                    if _near(x, n, i, k, radius):
+                        found += 1
+                        for a in range(3):
+                            total[a] += x[k, a] - x[i, a]
+                    k += 1
+        inner[i] = np.sqrt(np.sum(total * total)) <= ONE_SIDED * radius * found
+    return inner
+
+
+@njit(cache=True, parallel=True)
+def _medians(x: Any, n: Any, values: Any, key: Any, size: Any, radius: Any, lends: Any) -> Any:
+    """Medians (n, c) of values (n, c) over the neighbours that lend, itself included, and their number (n,)."""
+    m, c = values.shape
+    median, count = np.empty((m, c)), np.empty(m)
+    for i in prange(m):
+        near, found = np.empty((c, MOST)), 1
+        for a in range(c):
+            near[a, 0] = values[i, a]
+        for dz in range(-1, 2):
+            for dy in range(-1, 2):
+                row = key[i] + (dz * size[1] + dy) * size[0]
+                k = _first(key, row - 1)
                 while k < m and key[k] <= row + 1 and found < MOST:
-                    square = (x[k, 0] - x[i, 0]) ** 2 + (x[k, 1] - x[i, 1]) ** 2 + (x[k, 2] - x[i, 2]) ** 2
-                    alike = n[k, 0] * n[i, 0] + n[k, 1] * n[i, 1] + n[k, 2] * n[i, 2]
-                    if square <= radius * radius and alike >= SAME_SIDE:
+                    if k != i and lends[k] and _near(x, n, i, k, radius):
                         for a in range(c):
                             near[a, found] = values[k, a]
                         found += 1
                     k += 1
         for a in range(c):
-            median[o, a] = np.median(near[a, :found])
-        count[o] = found
+            median[i, a] = np.median(near[a, :found])
+        count[i] = found
     return median, count

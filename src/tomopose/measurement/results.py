@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,16 @@ import numpy as np
 
 from tomopose.files import atomic_folder, write_json, write_text
 from tomopose.measurement.alignment import Alignment
+from tomopose.measurement.budget import Budget, budget, half_width
 from tomopose.measurement.features import Feature
+from tomopose.measurement.uncertainty import Simulated
 from tomopose.provenance import Provenance
 
 SCHEMA = "measurement"
-COVERAGE = 0.95
 COLUMNS = ("volume", "name", "kind", "value", "u", "U95", "unit", "reference", "u_reference", "error", "limit",
            "within", "direction", "method")
+BUDGET_COLUMNS = ("volume", "name", "unit", "fit", "repeats", "calibration", "simulation", "mean_error", "corrected",
+                  "u", "dof", "U95")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,10 +60,8 @@ class MeasurementResult:
 
     @property
     def U(self) -> float:
-        """Half width of the 95 % interval of the value, by Student's t."""
-        from scipy.stats import t
-
-        return float(t.ppf(0.5 + COVERAGE / 2, self.dof) * self.u) if math.isfinite(self.u) else math.nan
+        """Half width of the 95 % interval of the value by the fit alone, by Student's t."""
+        return half_width(self.u, self.dof)
 
     @property
     def within(self) -> bool | None:
@@ -101,6 +102,8 @@ class MeasurementResults:
     results:  all measurands of all volumes;  features: volume -> name -> feature;  notes: volume -> remarks;
     scale:    volume -> factor that lengths were multiplied by (1 where no correction was made);
     alignments: volume -> part to W;  groups: name -> volumes that repeat one measurement.
+    calibration_u: volume -> measurand -> standard uncertainty from a calibration's covariance, where one was given;
+    simulated: measurand -> its error over virtual scans, where there were any.
     """
 
     plan_name: str
@@ -111,6 +114,8 @@ class MeasurementResults:
     spacing_mm: Mapping[str, float] = field(default_factory=dict)
     alignments: Mapping[str, Alignment] = field(default_factory=dict)
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    calibration_u: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    simulated: Mapping[str, Simulated] = field(default_factory=dict)
     provenance: Provenance | None = None
 
     def __len__(self) -> int:
@@ -132,6 +137,16 @@ class MeasurementResults:
             for name, rows in _by_name(r for r in self.results if r.volume in volumes).items()
         )
 
+    def budgets(self) -> tuple[Budget, ...]:
+        """The uncertainty of each result from all that is known."""
+        group = {v: g for g, volumes in self.groups.items() for v in volumes}
+        repeats = {(r.group, r.name): r for r in self.repeats()}
+        return tuple(
+            budget(r, repeat=repeats.get((group.get(r.volume, ""), r.name)),
+                   calibration=self.calibration_u.get(r.volume, {}).get(r.name), simulated=self.simulated.get(r.name))
+            for r in self.results
+        )
+
     @property
     def out_of_limits(self) -> tuple[MeasurementResult, ...]:
         return tuple(r for r in self.results if r.within is False)
@@ -143,27 +158,40 @@ class MeasurementResults:
             "alignments": {v: a.to_json() for v, a in self.alignments.items()},
             "results": [r.to_json() for r in self.results],
             "repeats": [vars(r) for r in self.repeats()],
+            "uncertainty": [b.to_json() for b in self.budgets()],
+            "simulated": {n: vars(s) for n, s in self.simulated.items()},
             "features": {v: {n: f.to_json() for n, f in found.items()} for v, found in self.features.items()},
             "notes": {v: list(n) for v, n in self.notes.items()},
             "provenance": None if self.provenance is None else self.provenance.to_json(),
         }
 
     def to_csv(self) -> str:
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        for r in self.results:
-            row = r.to_json()
-            writer.writerow(["" if row[c] is None else repr(row[c]) if isinstance(row[c], float) else row[c]
-                             for c in COLUMNS])
-        return text.getvalue()
+        return _table(COLUMNS, [r.to_json() for r in self.results])
+
+    def budgets_csv(self) -> str:
+        """Shares of the uncertainty, one row a result."""
+        return _table(BUDGET_COLUMNS, [b.to_json() for b in self.budgets()])
+
+
+def _table(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    for row in rows:
+        writer.writerow(["" if row[c] is None else repr(row[c]) if isinstance(row[c], float) else row[c]
+                         for c in columns])
+    return text.getvalue()
 
 
 def write_results(results: MeasurementResults, folder: str | Path, *, force: bool = False) -> None:
-    """measurement.json and measurement.csv into a folder, both or none.  FileError where they exist without `force`."""
+    """measurement.json, measurement.csv and uncertainty.csv into a folder, all or none.
+
+    FileError where they exist without `force`.
+    """
     with atomic_folder(folder, force=force) as temporary:
         write_json(temporary / "measurement.json", SCHEMA, results.to_json())
         write_text(temporary / "measurement.csv", results.to_csv())
+        write_text(temporary / "uncertainty.csv", results.budgets_csv())
 
 
 def _by_name(rows: Iterable[MeasurementResult]) -> dict[str, list[MeasurementResult]]:
