@@ -6,6 +6,7 @@ Usage: python benchmarks/manipulator/methods.py [--seeds 6]
     come from one ball (189 mixed poses before the scan; rigid and kinematic) or, as in paper ref. [8], from an object
     of six calibrated balls imaged in every view of the scan itself.
 2.  A C-arm: a hexapod of the same errors carries source and detector about a standing ball (150 poses), then scans.
+3.  Twin robots (6R, 0.2 mm, 0.02 deg): one carries the source, the other the detector (200 views), then they scan.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import argparse
 
 import numpy as np
 from manipulator_cases import DETECTION_PX, SCANNER, UM_PER_PX, hexapod_experiment, scan_error
-from run import HEXAPOD, WORN
+from run import HEXAPOD, ROBOT, WORN
+from twin_cases import twin_experiment, twin_scan_error
 
 from tomopose import BallObservations, Frame, PoseSequence, RigidTransform
 from tomopose.calibration.apply import projection_matrices
@@ -23,6 +25,7 @@ from tomopose.calibration.kinematic import calibrate_kinematic
 from tomopose.calibration.kinematic_trajectory import object_points, rms_px, without_object_pose
 from tomopose.calibration.multi_ball_pnp import poses_of_views
 from tomopose.calibration.solve import calibrate
+from tomopose.calibration.twin_robots import calibrate_twin
 from tomopose.geometry.projection import eq5_matrices, project, project_ball
 from tomopose.manipulator.inverse import inverse_poses
 from tomopose.manipulator.virtual import Disturbance, real_motion
@@ -72,6 +75,18 @@ def moving_scanner(seed: int) -> tuple[float, float]:
     return errors[0], errors[1]
 
 
+def twin_robots(seed: int) -> tuple[float, float, float]:
+    """rms error, px, of their scan: rigid, auto; what is stated for auto."""
+    e = twin_experiment(ROBOT, seed)
+    errors = []
+    for model in ("rigid", "auto"):
+        cal = calibrate_twin(
+            e.scanner, e.poses, e.observations, twin=e.twin, mount=e.mount, balls={0: e.ball}, model=model
+        )
+        errors.append(twin_scan_error(cal, e))
+    return errors[0][0], errors[1][0], errors[1][1]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=6)
@@ -79,6 +94,7 @@ def main() -> None:
     for title, names, rows in (
         ("same scan, worn hexapod", ("rigid", "kinematic, one ball", "six balls a view"), [one_scan(s) for s in seeds]),
         ("moving scanner", ("rigid", "auto"), [moving_scanner(s) for s in seeds]),
+        ("twin robots", ("rigid", "auto", "stated"), [twin_robots(s) for s in seeds]),
     ):
         rms = np.sqrt(np.mean(np.square(rows), axis=0))
         told = [f"{n} {r:.4f} px ({r * UM_PER_PX:.2f} um)" for n, r in zip(names, rms, strict=True)]

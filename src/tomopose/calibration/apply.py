@@ -105,7 +105,7 @@ def projection_matrices(
         _require_same_scanner(calibration, scanner)
     commanded = poses
     scale = float(calibration.manipulator.get("translation_scale", 1.0))
-    if calibration.model != "rigid":
+    if calibration.model != "rigid" or "kind" in calibration.manipulator:
         from tomopose.manipulator.error_models import corrected_poses
 
         poses = corrected_poses(calibration.manipulator, poses)

@@ -94,6 +94,7 @@ def calibrate_kinematic(
         bars=_known_bars(distances, data),
         view_sigma=dict(view_sigma or {}),
         repeatability=Repeatability() if machine is None else machine.repeatability,
+        inverse=isinstance(machine, InverseManipulator),
     )
     start = State(
         T_HT=rigid.T_HT,

@@ -115,7 +115,7 @@ def with_size(estimate: MapEstimate) -> tuple[MapEstimate, float]:
     factor too.
     """
     model = estimate.problem.model
-    if model is None or not len(model.names):
+    if model is None or not (model.groups >= 0).any():
         return estimate, 1.0
     group, m = model.groups, len(model.names)
     mine = group >= 0

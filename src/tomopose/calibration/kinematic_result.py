@@ -80,7 +80,7 @@ def scatter_block(fit: ModelFit) -> dict[str, float]:
 
 
 def calibration_of(
-    rigid: Calibration, fits: Mapping[str, ModelFit], judged: Mapping[str, Judgement], chosen: str, asked: str,
+    rigid: Calibration | None, fits: Mapping[str, ModelFit], judged: Mapping[str, Judgement], chosen: str, asked: str,
     ids: tuple[str, ...], doubts: tuple[str, ...],
 ) -> Calibration:
     fit = fits[chosen]
@@ -141,16 +141,19 @@ def calibration_of(
         status=f"optimum of {len(data)} poses reached with the {name} model",
         verdict="doubtful" if reasons else "trustworthy",
         reasons=tuple(reasons),
-        hypotheses=rigid.hypotheses,
+        hypotheses=() if rigid is None else rigid.hypotheses,
         pivot=data.pivot,
         convention=data.convention,
         extra={
-            **{k: v for k, v in rigid.extra.items() if k in ("not_seen",)},
+            **({"not_seen": dict(data.not_seen)} if data.not_seen else {}),
             **({"scanners": scanners} if len(scanners) > 1 else {}),
             **comparison(judged, fits, chosen),
         },
         provenance=provenance(
-            arguments={**({} if rigid.provenance is None else dict(rigid.provenance.arguments)), "model": asked}
+            arguments={
+                **({} if rigid is None or rigid.provenance is None else dict(rigid.provenance.arguments)),
+                "model": asked,
+            }
         ),
     )
 

@@ -24,12 +24,14 @@ from tomopose.calibration.fit import tangent_names
 from tomopose.calibration.parameters import FreeParameters, adjusted_scanners, translation_scale
 from tomopose.calibration.problem import Problem
 from tomopose.calibration.residuals import SCANNER_COLUMNS, projection_blocks, whiteners
+from tomopose.calibration.twin_projection import twin_blocks
 from tomopose.errors import NotConvergedError, TrajectoryError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import ErrorModel, Repeatability
+from tomopose.manipulator.twin import TwinRobots
 from tomopose.units import Array
 
 STEPS = 50
@@ -49,6 +51,7 @@ class KinematicProblem:
     bars:        (ball id, ball id) -> (distance, its standard uncertainty), mm.
     view_sigma:  scanner parameter -> standard deviation of its scatter from view to view (a C-arm's d_SD, say).
     repeatability, scatter:  of the plate from pose to pose, and the factor f on its variance.
+    inverse:     the table holds inverse poses: the plate is H, and turns about the origin of H.
     weight:      (n,) factor on the inverse covariances of the rows, or None.
     """
 
@@ -60,6 +63,7 @@ class KinematicProblem:
     view_sigma: Mapping[str, float] = field(default_factory=dict)
     repeatability: Repeatability = field(default_factory=Repeatability)
     scatter: float = 1.0
+    inverse: bool = False
     weight: Array | None = None
 
     @property
@@ -103,7 +107,7 @@ class State:
 @dataclass(frozen=True, kw_only=True)
 class Linearised:
     """Residuals r (n, 2) observed minus calculated, px; J (n, 2, m) of the prediction; C (n, 2, 2) px^2, with scatter;
-    J_pose (n, 2, 6) by (w, t) of the plate."""
+    J_pose (n, 2, 6) by the plate's own motion (w, t), which scatters."""
 
     r: Array
     J: Array
@@ -128,6 +132,8 @@ class MapEstimate:
 
 def linearise(problem: KinematicProblem, state: State) -> Linearised:
     """The prediction and its derivatives at theta."""
+    if isinstance(problem.model, TwinRobots):
+        return _linearise_twin(problem, problem.model, state)
     data, poses, free = problem.data, problem.poses, problem.free
     n, nb = len(poses), len(data.ball_ids)
     T_MH, J_errors = poses.T_MH, np.zeros((n, 6, 0))
@@ -145,13 +151,33 @@ def linearise(problem: KinematicProblem, state: State) -> Linearised:
     mine = (free.col_run[None, :] < 0) | (free.col_run[None, :] == data.run[:, None])
     J_free = blocks.J_scanner[:, :, free.cols] * free.factor * mine[:, None, :]
     J = np.concatenate([blocks.J_mount, J_balls.reshape(n, 2, 3 * nb), J_free, J_pose @ J_errors], axis=2)
-    C = data.covariance + problem.scatter * (J_pose * problem.repeatability.variance) @ np.swapaxes(J_pose, 1, 2)
+    J_plate = J_pose
+    if problem.inverse:
+        J_plate = np.concatenate([-blocks.G_H @ skew(blocks.x_H), blocks.G_H], axis=2)
+    C = data.covariance + problem.scatter * (J_plate * problem.repeatability.variance) @ np.swapaxes(J_plate, 1, 2)
     for name, sigma in problem.view_sigma.items():
         g = blocks.J_scanner[:, :, SCANNER_COLUMNS.index(name)] * sigma
         C = C + g[:, :, None] * g[:, None, :]
     if problem.weight is not None:
         C = C / problem.weight[:, None, None]
-    return Linearised(r=data.x_D - blocks.x_D, J=J, C=C, J_pose=J_pose)
+    return Linearised(r=data.x_D - blocks.x_D, J=J, C=C, J_pose=J_plate)
+
+
+def _linearise_twin(problem: KinematicProblem, twin: TwinRobots, state: State) -> Linearised:
+    """The same for twin robots, whose source moves against the panel; nothing of the scanner is free there."""
+    data = problem.data
+    n, nb = len(problem.poses), len(data.ball_ids)
+    b = twin_blocks(
+        data.scanner, twin, T_HT=state.T_HT, poses=problem.poses, p=state.p, t=state.balls[data.ball]
+    )
+    J_balls = np.zeros((n, 2, nb, 3))
+    J_balls[np.arange(n), :, data.ball] = b.J_t
+    scatter = (b.J_plate * problem.repeatability.variance) @ np.swapaxes(b.J_plate, 1, 2) + b.C_source
+    C = data.covariance + problem.scatter * scatter
+    if problem.weight is not None:
+        C = C / problem.weight[:, None, None]
+    J = np.concatenate([b.J_mount, J_balls.reshape(n, 2, 3 * nb), b.J_p], axis=2)
+    return Linearised(r=data.x_D - b.x_D, J=J, C=C, J_pose=b.J_plate)
 
 
 def _bar_rows(problem: KinematicProblem, state: State) -> tuple[Array, Array]:

@@ -120,7 +120,8 @@ def scatter_variance(calibration: Calibration, poses: PoseSequence, x_M: Any) ->
     if variance.any():
         for i, x in enumerate(np.asarray(x_M, dtype=np.float64)):
             b = projection_blocks(calibration.scanner, T_HT=calibration.T_HT, T_MH=T_MH, t=x, alpha=poses.alpha)
-            J = np.concatenate([-b.G_H @ skew(b.x_H - T_MH.t), b.G_H], axis=2)
+            lever = b.x_H if calibration.manipulator.get("kind") == "inverse" else b.x_H - T_MH.t
+            J = np.concatenate([-b.G_H @ skew(lever), b.G_H], axis=2)
             V[:, i] = (J**2) @ variance
     return V
 
@@ -132,8 +133,10 @@ def trajectory_sigma(
 
     scatter: add the manipulator's scatter from pose to pose, for the single view; else the part that views share.
     """
-    J, J_pose = trajectory_jacobian(calibration, poses, points)
+    J, _ = trajectory_jacobian(calibration, poses, points)
     V = np.einsum("nmic,cd,nmid->nmi", J, calibration.covariance, J, optimize=True)
     if scatter:
-        V = V + (J_pose**2) @ scatter_of(calibration)
+        x_W = np.asarray(points, dtype=np.float64)
+        x_M = (calibration.scanner.T_TW(0.0).inv.apply(x_W) - calibration.T_HT.t) @ calibration.T_HT.R
+        V = V + scatter_variance(calibration, correction(calibration.manipulator, poses).poses, x_M)
     return np.sqrt(np.maximum(V, 0.0))

@@ -84,7 +84,7 @@ def model_from_block(manipulator: Mapping[str, Any]) -> tuple[ErrorModel, Array]
     try:
         values = np.array(manipulator["values"], dtype=np.float64)
         kind = manipulator["kind"]
-        model = _machine(kind, manipulator["nominal"], where)
+        model = machine_from_block(kind, manipulator["nominal"], where)
     except KeyError as error:
         raise InputError(f"{where}: the key {error} is missing") from error
     if tuple(manipulator.get("names", ())) != model.names or values.shape != (len(model.names),):
@@ -92,13 +92,16 @@ def model_from_block(manipulator: Mapping[str, Any]) -> tuple[ErrorModel, Array]
     return model, values
 
 
-def _machine(kind: str, nominal: Mapping[str, Any], where: str) -> ErrorModel:
+def machine_from_block(kind: str, nominal: Mapping[str, Any], where: str) -> ErrorModel:
+    """The machine of a block's `nominal`."""
+    if kind == "twin":
+        raise InputError(f"{where} holds twin robots, whose scans need two pose tables; use twin_matrices")
     if kind == "hexapod":
         return hexapod_from_document(nominal, where)
     if kind == "serial":
         return serial_from_document(nominal, where)
     if kind == "inverse":
-        return InverseManipulator(machine=_machine(nominal["kind"], nominal["machine"], where))
+        return InverseManipulator(machine=machine_from_block(nominal["kind"], nominal["machine"], where))
     if kind == "map":
         return PoseMap(
             order=int(nominal["order"]), t_scale=nominal["t_scale_mm"], w_scale=nominal["w_scale_rad"],

@@ -63,7 +63,7 @@ class InverseManipulator:
 
     @property
     def repeatability(self) -> Repeatability:
-        """That of the machine, which is the same for small motions seen from either side but for the lever: see J."""
+        """That of the machine: of turns about and shifts of its plate, which is H here."""
         return self.machine.repeatability
 
     def real_poses(self, poses: PoseSequence, p: Array) -> RealPoses:
