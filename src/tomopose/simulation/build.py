@@ -59,7 +59,7 @@ def simulate(scene: S.Scene, *, poses: PoseSequence | None = None) -> SimulatedR
         meshes=meshes,
         materials=materials,
         spectrum=_spectrum(scene, materials),
-        detector=_detector(scene.detector),
+        detector=_detector(scene.detector, scene.scanner.binning),
         seed=scene.seed,
         spot=FocalSpot(**_without_units(scene.source.spot)),
         motion=Motion(
@@ -136,15 +136,23 @@ def _spectrum(scene: S.Scene, materials: Mapping[str, Material]) -> Spectrum:
     return spectrum.absorbed_energy(detector.scintillator, detector.thickness_mm, materials)
 
 
-def _detector(part: S.DetectorPart) -> Detector:
+def _detector(part: S.DetectorPart, b: int) -> Detector:
+    """The detector; a scene gives lengths in the unbinned detector's pixels, `Detector` takes most in the image's."""
     values = _without_units(part)
     for name in ("scintillator", "thickness", "response"):
         del values[name]
     if values["snr"] is None:
         values["snr"] = 200.0
-    mtf = None if part.mtf is None else MTF(frequency=part.mtf.frequency_per_px, value=part.mtf.value)
-    scatter, glare = Scatter(**_without_units(part.scatter)), Glare(**_without_units(part.glare))
-    return Detector(**{**values, "mtf": mtf, "scatter": scatter, "glare": glare})
+    frequency = () if part.mtf is None else tuple(b * f for f in part.mtf.frequency_per_px)
+    changed = {
+        "blur_sigma": part.blur_sigma_px / b,
+        "mtf": None if part.mtf is None else MTF(frequency=frequency, value=part.mtf.value),
+        "scatter": Scatter(
+            constant=part.scatter.constant, amount=part.scatter.amount, sigma=part.scatter.sigma_px / b
+        ),
+        "glare": Glare(share=part.glare.share, sigma=part.glare.sigma_px / b),
+    }
+    return Detector(**{**values, **changed, "binning": b})
 
 
 def _objects(

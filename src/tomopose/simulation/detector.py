@@ -1,6 +1,7 @@
 """The detector: from the noiseless image to grey values.
 
 quanta     q = Poisson(q_0 profile signal), spread over neighbours by the scintillator (noise correlation)
+binned     q summed over binning x binning detector pixels, as charge, before it is read out
 raw        g = dark + gain q + readout noise, held between 0 and saturation, rounded to `bits`
 corrected  c = white (g - dark) / (flat - dark), with averaged dark and flat images that have their own noise
 """
@@ -34,13 +35,15 @@ PATTERN, FLATS = 1, 2
 
 @dataclass(frozen=True, kw_only=True)
 class Detector:
-    """What the detector does to the image.
+    """What the detector does to the image.  Pixels are those of the image, where not said otherwise.
 
     snr:         of one pixel of one averaged frame in the empty beam, before readout noise (inf: no noise); or
-    photons:     detected quanta per pixel and single exposure, which then fixes snr.
+    photons:     detected quanta per detector pixel and single exposure, which then fixes snr.
+    binning:     a pixel is binning x binning detector pixels, whose charges are summed before they are digitised.
     averages:    exposures averaged into a frame.
     blur_sigma:  px, Gaussian, before the pixel integrates.  mtf: a measured MTF besides.
-    noise_sigma: px, Gaussian: how far one quantum's light spreads; correlates the noise (NPS = exp(-4 pi^2 s^2 f^2)).
+    noise_sigma: detector px, Gaussian: how far one quantum's light spreads; correlates the noise (its power is
+                 exp(-4 pi^2 s^2 f^2)).
     white:       grey value of the empty beam.  bits: depth.  saturation: largest grey value.
     output:      "corrected" (dark and flat removed) or "raw".
     dark, readout_noise: grey values.  gain_spread, dark_spread: pixel-to-pixel standard deviations (relative; grey).
@@ -53,6 +56,7 @@ class Detector:
     snr: float = 200.0
     photons: float | None = None
     averages: int = 1
+    binning: int = 1
     blur_sigma: float = 0.7
     mtf: MTF | None = None
     noise_sigma: float = 0.0
@@ -93,13 +97,14 @@ class Detector:
             raise InputError(f"detector: bits is {self.bits}; 1 to 16 are possible")
         if not 0 < self.white < 2**self.bits:
             raise InputError(f"detector: white is {self.white:g}; it must lie below {2**self.bits}")
-        if min(self.averages, self.flats, self.cells) < 1 or self.cells > 16:
-            raise InputError("detector: averages, flats and cells are 1 or more, cells at most 16")
+        if min(self.averages, self.binning, self.flats, self.cells) < 1 or self.cells > 16:
+            raise InputError("detector: averages, binning, flats and cells are 1 or more, cells at most 16")
 
     @property
     def kernel_power(self) -> float:
-        """Sum of the squared noise kernel: what correlation leaves of the quanta's variance."""
-        return float((self.noise_kernel**2).sum() ** 2)
+        """Relative variance of a pixel times the quanta of a detector pixel: what correlation and binning leave."""
+        c = np.convolve(self.noise_kernel, np.ones(self.binning)) / self.binning
+        return float((c**2).sum() ** 2)
 
     @property
     def noise_kernel(self) -> Array:
@@ -112,7 +117,7 @@ class Detector:
 
     @property
     def quanta(self) -> float:
-        """Quanta per pixel and frame in the empty beam."""
+        """Quanta per detector pixel and frame in the empty beam."""
         return self.snr**2 * self.kernel_power
 
     @property
@@ -140,25 +145,45 @@ def beam_profile(scanner: Scanner, detector: Detector) -> Array | None:
 
 @functools.lru_cache(maxsize=4)
 def fixed_pattern(detector: Detector, shape: tuple[int, int], seed: int) -> tuple[Any, Any, Any]:
-    """(gain, dark, dead) images (n_v, n_u): factors around 1, grey values, and which pixels read 0."""
+    """(gain, dark, dead) images (n_v, n_u): factors around 1, grey values, and which pixels read 0.
+
+    A binned pixel has the mean of its detector pixels; those that are dead give nothing.
+    """
     rng = np.random.default_rng(np.random.SeedSequence([seed, 0, PATTERN]))
-    gain = 1 + detector.gain_spread * rng.standard_normal(shape)
-    dark = detector.dark + detector.dark_spread * rng.standard_normal(shape)
-    return np.maximum(gain, 0.0), dark, rng.random(shape) < detector.dead_share
+    fine = (shape[0] * detector.binning, shape[1] * detector.binning)
+    gain = np.maximum(1 + detector.gain_spread * rng.standard_normal(fine), 0.0)
+    dark = detector.dark + detector.dark_spread * rng.standard_normal(fine)
+    dead = rng.random(fine) < detector.dead_share
+    if detector.binning == 1:
+        return gain, dark, dead
+    gain, dark = (blocks(np.where(dead, 0.0, a), detector.binning) for a in (gain, dark))
+    return gain / detector.binning**2, dark / detector.binning**2, blocks(~dead, detector.binning) == 0
 
 
-def counted(signal: Array, detector: Detector, *, key: Any, threads: int) -> Array:
-    """Quanta (n_v, n_u) that a pixel reads, float32: Poisson numbers about signal x quanta, spread by the
-    scintillator."""
-    n_v = signal.shape[0]
-    mean, quanta = signal * detector.quanta, np.empty(signal.shape, dtype=np.float32)
-    in_bands(lambda lo, hi: add_photon_noise(mean, key, lo, hi, quanta), n_v, threads)
-    if detector.noise_sigma > 0:
-        k, rows = detector.noise_kernel.astype(np.float32), np.empty_like(quanta)
-        np.subtract(quanta, mean, out=quanta, casting="same_kind")
-        in_bands(lambda lo, hi: spread_rows(quanta, k, lo, hi, rows), n_v, threads)
-        in_bands(lambda lo, hi: spread_columns(rows, k, mean, lo, hi, quanta), n_v, threads)
-    return quanta
+def blocks(image: Any, b: int) -> Any:
+    """Sums over blocks of b x b pixels."""
+    return image.reshape(image.shape[0] // b, b, image.shape[1] // b, b).sum(axis=(1, 3))
+
+
+def counted(signal: Array, detector: Detector, *, key: Any, threads: int) -> Any:
+    """Quanta (n_v, n_u) that a pixel reads, float32: Poisson numbers about signal x quanta, spread by the scintillator,
+    summed over the detector pixels that are binned."""
+    b = detector.binning
+    if detector.noise_sigma == 0:
+        # A sum of Poisson numbers is one.
+        mean, quanta = signal * (detector.quanta * b * b), np.empty(signal.shape, dtype=np.float32)
+        in_bands(lambda lo, hi: add_photon_noise(mean, key, lo, hi, quanta), len(mean), threads)
+        return quanta
+    mean = signal * detector.quanta
+    if b > 1:
+        mean = mean.repeat(b, axis=0).repeat(b, axis=1)
+    quanta, k = np.empty(mean.shape, dtype=np.float32), detector.noise_kernel.astype(np.float32)
+    rows = np.empty_like(quanta)
+    in_bands(lambda lo, hi: add_photon_noise(mean, key, lo, hi, quanta), len(mean), threads)
+    np.subtract(quanta, mean, out=quanta, casting="same_kind")
+    in_bands(lambda lo, hi: spread_rows(quanta, k, lo, hi, rows), len(mean), threads)
+    in_bands(lambda lo, hi: spread_columns(rows, k, mean, lo, hi, quanta), len(mean), threads)
+    return quanta if b == 1 else blocks(quanta, b)
 
 
 def _raw(signal: Array, detector: Detector, *, seed: int, frame: int, threads: int) -> Array:
@@ -171,7 +196,7 @@ def _raw(signal: Array, detector: Detector, *, seed: int, frame: int, threads: i
         quanta, scale = signal, detector.white
     else:
         quanta = counted(signal, detector, key=frame_key(seed, frame), threads=threads)
-        scale = detector.white / detector.quanta
+        scale = detector.white / (detector.quanta * detector.binning**2)
     raw = dark + gain * (scale * quanta.astype(np.float64))
     if detector.readout_noise > 0:
         sigma, key = detector.readout_noise / math.sqrt(detector.averages), frame_key(seed, frame, 8)
@@ -207,7 +232,7 @@ def expose(T: Array, detector: Detector, scanner: Scanner, *, seed: int, frame: 
     out = np.empty(T.shape, dtype=np.uint16)
     if not (detector.patterned or detector.dead_share or detector.readout_noise or math.isinf(detector.snr)):
         quanta = counted(T, detector, key=frame_key(seed, frame), threads=threads)
-        gain = detector.white / detector.quanta
+        gain = detector.white / (detector.quanta * detector.binning**2)
         in_bands(lambda lo, hi: digitise(quanta, gain, 0.0, detector.top, lo, hi, out), n_v, threads)
         return out
     profile = beam_profile(scanner, detector)

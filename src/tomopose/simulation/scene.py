@@ -33,7 +33,9 @@ class ScannerPart(Part):
     theta_rad: float = 0.0
     phi_rad: float = 0.0
     image_rows: Literal["top-first", "bottom-first"] = "top-first"
-    binning: int = Field(1, ge=1, description="the detector's pixels are averaged in blocks; sizes above are unbinned")
+    binning: int = Field(
+        1, ge=1, description="the charges of binning x binning pixels are summed; all sizes and px are unbinned"
+    )
 
 
 class FilterPart(Part):
