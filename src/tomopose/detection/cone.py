@@ -172,37 +172,42 @@ def ring_pixels(window, good, u_first, v_first, u_c, v_c, low, high, ratio_u, ra
 
 
 @njit(cache=True, fastmath=True)
-def by_sector(u, v, value, rim, low, high, thin_from, k):  # type: ignore[no-untyped-def]
-    """The pixels with s in (low, high), ordered by sector: u, v, value, rim, left (n,), share (n,), first (k + 1,).
+def by_sector(u, v, value, rim, low, high, thin_from, k, edges):  # type: ignore[no-untyped-def]
+    """The pixels with s in (low, high), by sector and in it by shell: u, v, value, rim, left (n,), share (n,), first.
 
     Sector j reaches from angular node j to the next; left is that j, share how far a pixel lies towards the next node.
-    Every second pixel with s > thin_from is left out.  first: where each sector begins.
+    Its shells are cut at the distances `edges` (m,); shell i of it begins at first[j (m + 1) + i], first has
+    k (m + 1) + 1 entries.  Every second pixel with s > thin_from is left out.
     """
-    turn = k / (2.0 * math.pi)
-    sector, part = np.empty(u.shape[0], np.int64), np.empty(u.shape[0])
-    first = np.zeros(k + 1, np.int64)
+    turn, shells = k / (2.0 * math.pi), edges.shape[0] + 1
+    cell, part = np.empty(u.shape[0], np.int64), np.empty(u.shape[0])
+    first = np.zeros(k * shells + 1, np.int64)
     for i in range(u.shape[0]):
         s = rim[0, i]
-        sector[i] = -1
+        cell[i] = -1
         if s > low and s < high and (s < thin_from or (int(u[i]) + int(v[i])) % 2 == 0):
             angle = _direction(rim[4, i], rim[5, i]) * turn
             node = min(int(angle), k - 1)
-            sector[i], part[i] = node, angle - node
-            first[node + 1] += 1
-    for j in range(k):
+            shell = 0
+            while shell < shells - 1 and s > edges[shell]:
+                shell += 1
+            cell[i], part[i] = node * shells + shell, angle - node
+            first[cell[i] + 1] += 1
+    for j in range(k * shells):
         first[j + 1] += first[j]
-    n = first[k]
+    n = first[k * shells]
     place = first.copy()
     new_u, new_v, new_value, share, left = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n, np.int64)
     new_rim = np.empty((6, n))
     source = np.empty(n, np.int64)
     for i in range(u.shape[0]):
-        if sector[i] >= 0:
-            source[place[sector[i]]] = i
-            place[sector[i]] += 1
+        if cell[i] >= 0:
+            source[place[cell[i]]] = i
+            place[cell[i]] += 1
     for at in range(n):
         i = source[at]
-        new_u[at], new_v[at], new_value[at], left[at], share[at] = u[i], v[i], value[i], sector[i], part[i]
+        new_u[at], new_v[at], new_value[at], share[at] = u[i], v[i], value[i], part[i]
+        left[at] = cell[i] // shells
     for c in range(6):
         for at in range(n):
             new_rim[c, at] = rim[c, source[at]]

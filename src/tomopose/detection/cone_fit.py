@@ -17,6 +17,7 @@ import numpy.typing as npt
 from tomopose.detection.cholesky import solve
 from tomopose.detection.cone import ring_pixels
 from tomopose.detection.edges import FIRST_NODE, N_SHAPE, SHAPE, influence
+from tomopose.detection.nested import nearer
 from tomopose.detection.noise import correlation, sandwich, weights
 from tomopose.detection.rim import STAY, Rim
 from tomopose.errors import BallNotFoundError
@@ -27,10 +28,13 @@ OUTLIER = 6.0
 """Residual in standard deviations from which a single pixel counts as bad."""
 GROSS = 0.1
 """Share of the contrast from which a residual can spoil a least-squares start."""
-MISFIT = 6.0
+MISFIT = 4.0
 """Standard deviations by which a sector's chi-square must exceed 1 for its background to count as badly fitted."""
 STEEPEST = 6.0
 """Prior: the background changes over the ring by no more than this many standard deviations of the ring's values."""
+FEW_BENT, BENT = 0.1, 10.0
+"""Prior share of nodes where the background is bent, and its curvature there, in variances of the estimate."""
+LEAST_TAU2 = 1e-3
 KAPPA_STARTS = (0.3, 1.0, 3.0, 8.0)
 """Total attenuations along the diameter from which a ball that X-rays pass is fitted; below the first the shape of
 the profile no longer depends on it."""
@@ -106,6 +110,7 @@ def fit_cone(
     if kappa_free:
         _choose_kappa(rim, spread, start)
         shape = (*shape, "kappa")
+
     rim.outside, rim.every = rim.reach, 1
     rim.gather()
     _robust_background(rim, spread)
@@ -114,16 +119,19 @@ def fit_cone(
             if rim.step(rim.active(*shape, curvature=False), careful=True) < 1e-3:
                 break
     active = rim.active(*shape)
-    for turn in range(3):
-        v_in, v_out, excess = _weigh(rim, floor, 2.0 if turn == 0 else 2.5)
-        widest = (rim.reach**2 / (STEEPEST * spread)) ** 2
-        if turn == 0:
-            rim.precision[2::3] = widest
-        elif turn == 1:
-            rim.precision[2::3] = np.maximum(_curvature_precision(rim, active), widest)
-        for _ in range(3 if kappa_free else 1 if turn < 2 else 4):
-            if rim.step(active, careful=kappa_free) < 1e-4:
-                break
+    widest = (rim.reach**2 / (STEEPEST * spread)) ** 2
+    if kappa_free:
+        _weigh(rim, floor, 2.0)
+        rim.precision[2::3] = widest
+        for _ in range(3):
+            rim.step(active, careful=True)
+    noise = _weigh(rim, floor, 2.0)
+    rim.precision[2::3] = np.maximum(_curvature_precision(rim, active), widest)
+    for _ in range(3 if kappa_free else 1):
+        rim.step(active, careful=kappa_free)
+    noise = _weigh(rim, floor, 2.5)
+    rim.polish(active, careful=kappa_free)
+    doubt = nearer(rim, active, careful=kappa_free)
     anisotropy, anisotropy_covariance = _anisotropy(rim, shape)
     significance = float(anisotropy @ np.linalg.solve(anisotropy_covariance, anisotropy))
     if significance > 30.0 and np.hypot(*anisotropy) > 0.1 * rim.shape[3] ** 2:
@@ -132,7 +140,7 @@ def fit_cone(
         for _ in range(3):
             rim.step(active)
         anisotropy = rim.shape[5:7].copy()
-    return _result(rim, shape, active, (v_in, v_out), excess, anisotropy, anisotropy_covariance)
+    return _result(rim, shape, active, noise, doubt, anisotropy, anisotropy_covariance)
 
 
 def _approach(rim: Rim, spread: float) -> None:
@@ -220,40 +228,56 @@ def _choose_kappa(rim: Rim, spread: float, start: Array) -> None:
     rim.evaluate()
 
 
-def _weigh(rim: Rim, floor: float, parameters: float) -> tuple[float, float, Array]:
-    """Noise at the ball's and the background's level, single outliers dropped, how badly sectors fit.
+@dataclass(frozen=True, kw_only=True)
+class _Noise:
+    """Variance inside and outside; each sector's chi-square outside less 1, and what noise alone lets it vary by."""
 
-    The noise is the median over the sectors round the rim, so that a holder's edge that no smooth background follows
-    does not count as noise; parameters: linear parameters that a sector's pixels determine.  The last result
-    is each sector's chi-square less 1, in standard deviations.
-    """
-    weight, v_in, v_out, chi2, n_k = weights(
+    inside: float
+    outside: float
+    excess: Array
+    scatter: float
+
+
+def _weigh(rim: Rim, floor: float, parameters: float) -> _Noise:
+    """Gives the pixels weights by the noise of the image; parameters: linear ones that a sector's pixels determine."""
+    weight, v_in, v_out, excess, scatter = weights(
         rim.rim[0], rim.residual, rim.model, rim.first, rim.shape[3], rim.level, rim.white, floor, parameters, OUTLIER
     )
     if not math.isfinite(v_out):
         raise BallNotFoundError("too few usable pixels outside the rim to measure the noise")
     rim.weight = weight
-    return v_in, v_out, (chi2 - 1.0) / np.sqrt(2.0 / np.maximum(n_k, 1))
+    return _Noise(inside=v_in, outside=v_out, excess=excess, scatter=scatter)
 
 
 def _curvature_precision(rim: Rim, active: npt.NDArray[np.intp]) -> Array:
-    """Empirical Bayes: 1 / tau_k^2 with tau_k^2 what the estimated curvature shows above its own variance."""
+    """Empirical Bayes: 1 / tau_k^2, where most nodes share one small tau and few, at a holder's edges, have their own.
+
+    With z_k the estimate of c_k without prior in its standard deviations, the share p_k of the evidence that node k is
+    one of the few (a normal of variance 1 + BENT against one of variance 1) weighs what z_k^2 shows above its noise;
+    all nodes have in common what the others' mean square shows above it.
+    """
     kept, rim.precision = rim.precision, rim.precision.copy()
     rim.precision[2::3] = 0.0
-    N, _ = rim.normal(active)
+    N, g = rim.normal(active)
     rim.precision = kept
     at = np.searchsorted(active, np.arange(FIRST_NODE + 2, FIRST_NODE + 3 * rim.n_nodes, 3))
-    unit = np.zeros((active.size, at.size))
+    unit = np.zeros((active.size, at.size + 1))
     unit[at, np.arange(at.size)] = 1.0
-    V = solve(N, unit)[at, np.arange(at.size)]
-    excess = rim.nodes[:, 2] ** 2 - V
-    smooth = (np.roll(excess, 1) + 2 * excess + np.roll(excess, -1)) / 4
-    return np.where(V > 0, 1.0 / np.maximum(np.maximum(smooth, 1e-3 * V), 1e-300), 0.0)
+    unit[:, -1] = g
+    X = solve(N, unit)[at]
+    V, c = X[np.arange(at.size), np.arange(at.size)], rim.nodes[:, 2] + X[:, -1]
+    z2 = np.where(V > 0, c**2 / np.where(V > 0, V, 1.0), 0.0)
+    p = 1.0 / (1.0 + (1.0 / FEW_BENT - 1.0) * math.sqrt(1.0 + BENT) * np.exp(-0.5 * z2 * BENT / (1.0 + BENT)))
+    common = max(float(np.sum((1.0 - p) * (z2 - 1.0)) / max(np.sum(1.0 - p), 1.0)), LEAST_TAU2)
+    own = p * np.maximum(z2 - 1.0, 0.0) * V
+    smooth = (np.roll(own, 1) + 2 * own + np.roll(own, -1)) / 4
+    return np.where(V > 0, 1.0 / np.maximum(smooth + common * V, 1e-300), 0.0)
 
 
 def _anisotropy(rim: Rim, shape: tuple[str, ...]) -> tuple[Array, Array]:
     """One Gauss-Newton step towards a blur that depends on direction, and its covariance, px^2."""
     active = rim.active(*shape, "q_cos", "q_sin")
+    rim.turned, rim._sums = True, None
     N, g = rim.normal(active)
     at = np.searchsorted(active, [SHAPE.index(q) for q in ("q_cos", "q_sin")])
     right = np.zeros((active.size, 3))
@@ -267,8 +291,8 @@ def _result(
     rim: Rim,
     shape: tuple[str, ...],
     active: npt.NDArray[np.intp],
-    variances: tuple[float, float],
-    excess: Array,
+    noise: _Noise,
+    doubt: Array,
     anisotropy: Array,
     anisotropy_covariance: Array,
 ) -> ConeFit:
@@ -278,8 +302,8 @@ def _result(
     at = [SHAPE.index(name) for name in shape]
     block = (rows[:, :m] + rows[:, :m].T) / 2
     s, sigma = rim.rim[0], rim.shape[3]
-    clean = (rim.weight > 0) & (excess < MISFIT)[rim.left]
-    outside = (s > 3 * sigma) & (rim.weight > 0) & (excess <= np.median(excess))[rim.left]
+    clean = (rim.weight > 0) & (noise.excess < MISFIT * noise.scatter)[rim.left]
+    outside = (s > 3 * sigma) & (rim.weight > 0) & (noise.excess <= np.median(noise.excess))[rim.left]
     normalised = rim.residual * np.sqrt(rim.weight)
     rho = correlation(
         rim.u[outside], rim.v[outside], normalised[outside], max(outside.sum() / (1.5 * rim.n_nodes), 3.0)
@@ -292,6 +316,7 @@ def _result(
     chi2_near = float((normalised[near] ** 2).mean()) if near.any() else 1.0
     if chi2_near > 1.0 + 5.0 * math.sqrt(2.0 / n_near):
         block = block * chi2_near
+    block[:2, :2] += doubt
     all_near = (np.abs(s) <= 3 * sigma) & (rim.weight > 0)
     rim_rms = math.sqrt(float((rim.residual[all_near] ** 2).mean())) if all_near.any() else 0.0
     covariance = np.full((N_SHAPE, N_SHAPE), np.nan)
@@ -304,14 +329,14 @@ def _result(
         shape_covariance=covariance,
         level=rim.level,
         white=float(rim.white),
-        noise_in=math.sqrt(variances[0]),
-        noise_out=math.sqrt(variances[1]),
+        noise_in=math.sqrt(noise.inside),
+        noise_out=math.sqrt(noise.outside),
         chi2_dof=float((normalised[weighted] ** 2).sum() / max(int(weighted.sum()) - len(active), 1)),
         rho=rho,
         visible=visible,
         lost=lost,
         rim_rms=rim_rms,
-        misfit=float((excess >= MISFIT).mean()),
+        misfit=float((noise.excess >= MISFIT * noise.scatter).mean()),
         anisotropy=anisotropy,
         anisotropy_covariance=anisotropy_covariance,
     )

@@ -21,6 +21,9 @@ N_SHAPE = len(SHAPE)
 WHITE = N_SHAPE
 FIRST_NODE = N_SHAPE + 1
 """Parameters in order: shape (7), w, then a_k, b_k, c_k in turn."""
+SHELL_EDGES = (7.0, 10.0, 14.0)
+"""Distances from the rim, px, at which the ring is cut into shells."""
+SHELLS = len(SHELL_EDGES) + 1
 
 
 @njit(cache=True, fastmath=True)
@@ -85,47 +88,72 @@ def model_rows(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True)
-def normal_equations(image, value, jacobian, first, weight):  # type: ignore[no-untyped-def]
-    """(N, g): weighted normal matrix (8 + 3k, 8 + 3k) and right side J' W (image - value).
+def normal_equations(image, value, jacobian, first, weight, columns, low, high):  # type: ignore[no-untyped-def]
+    """(N, g): weighted normal matrix (8 + 3k, 8 + 3k) and right side J' W (image - value) of the shells low to high.
 
-    first: (k + 1,) of by_sector.  Within a sector every entry is one sum along the pixels, which runs in registers.
+    first: (k SHELLS + 1,) of by_sector.  columns: rows of the Jacobian that count (the others are left 0).  Within a
+    sector every entry is one sum along the pixels, which runs in registers.
     """
-    k = first.shape[0] - 1
-    size = 8 + 3 * k
+    k = (first.shape[0] - 1) // SHELLS
+    size = FIRST_NODE + 3 * k
     N = np.zeros((size, size))
     g = np.zeros(size)
-    column = np.empty(14, np.int64)
     longest = 0
     for node in range(k):
-        longest = max(longest, first[node + 1] - first[node])
+        longest = max(longest, first[node * SHELLS + high] - first[node * SHELLS + low])
     row = np.empty(longest)
     for node in range(k):
-        low, n = first[node], first[node + 1] - first[node]
+        start = first[node * SHELLS + low]
+        n = first[node * SHELLS + high] - start
         if n == 0:
             continue
-        right = node + 1 if node + 1 < k else 0
-        for p in range(8):
-            column[p] = p
-        for p in range(3):
-            column[8 + p] = 8 + 3 * node + p
-            column[11 + p] = 8 + 3 * right + p
-        w, y, y_model = weight[low : low + n], image[low : low + n], value[low : low + n]
-        for p in range(14):
-            a = jacobian[p, low : low + n]
+        w, y, y_model = weight[start : start + n], image[start : start + n], value[start : start + n]
+        for i_p in range(columns.shape[0]):
+            p = columns[i_p]
+            at_p = _place(p, node, k)
+            a = jacobian[p, start : start + n]
             total = 0.0
             for i in range(n):
                 row[i] = a[i] * w[i]
                 total += row[i] * (y[i] - y_model[i])
-            g[column[p]] += total
-            for q in range(p + 1):
-                b = jacobian[q, low : low + n]
+            g[at_p] += total
+            for i_q in range(i_p + 1):
+                q = columns[i_q]
+                at_q = _place(q, node, k)
+                b = jacobian[q, start : start + n]
                 total = 0.0
                 for i in range(n):
                     total += row[i] * b[i]
-                N[column[p], column[q]] += total
-                if p != q:
-                    N[column[q], column[p]] += total
+                N[at_p, at_q] += total
+                if i_p != i_q:
+                    N[at_q, at_p] += total
     return N, g
+
+
+@njit(cache=True, inline="always")
+def _place(p, node, k):  # type: ignore[no-untyped-def]
+    """Where parameter p of a sector's Jacobian stands among all parameters."""
+    if p < FIRST_NODE:
+        return p
+    if p < FIRST_NODE + 3:
+        return p + 3 * node
+    return p - 3 + 3 * (node + 1 if node + 1 < k else 0)
+
+
+@njit(cache=True, fastmath=True)
+def gradient(image, value, jacobian, first, weight, columns, high):  # type: ignore[no-untyped-def]
+    """g alone of normal_equations, of the shells before `high`."""
+    k = (first.shape[0] - 1) // SHELLS
+    g = np.zeros(FIRST_NODE + 3 * k)
+    for node in range(k):
+        start, stop = first[node * SHELLS], first[node * SHELLS + high]
+        for i_p in range(columns.shape[0]):
+            p = columns[i_p]
+            total = 0.0
+            for i in range(start, stop):
+                total += jacobian[p, i] * weight[i] * (image[i] - value[i])
+            g[_place(p, node, k)] += total
+    return g
 
 
 @njit(cache=True)

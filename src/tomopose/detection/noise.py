@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
+from scipy.ndimage import convolve
 
 from tomopose.units import Array
 
-REACH = 2
+REACH = 4
 """Largest lag, px, at which correlation is looked for: a scintillator's or an interpolation's."""
 SIGNIFICANT = 5.0
 """Standard deviations by which a neighbour's correlation must differ from 0 before noise counts as correlated."""
@@ -21,11 +24,12 @@ NORMAL_MEDIAN = 0.455
 
 @njit(cache=True)
 def weights(s, residual, model, first, sigma, level, white, floor, parameters, outlier):  # type: ignore[no-untyped-def]
-    """(weight (n,), variance inside, outside, chi-square (k,) and number (k,) of each sector's pixels outside).
+    """(weight (n,), variance inside, outside, excess (k,), spread): weights by a variance linear in the level.
 
     s: signed distance; first: (k + 1,) of by_sector; floor: least variance; parameters: linear parameters that a
-    sector's pixels determine.  Pixels more than `outlier` standard deviations off get no weight.  The variance
-    outside is the median over the sectors, NaN where none has enough pixels.
+    sector's pixels determine.  Pixels more than `outlier` standard deviations off get no weight.  The variance outside
+    is that of the sectors that are fitted well, NaN where none has enough pixels; excess: each sector's chi-square
+    outside less 1; spread: what noise alone lets it vary by.
     """
     n, k = s.shape[0], first.shape[0] - 1
     square = residual * residual
@@ -47,7 +51,7 @@ def weights(s, residual, model, first, sigma, level, white, floor, parameters, o
             n_rim += 1
     rim_limit = outlier**2 * np.median(part[:n_rim]) / NORMAL_MEDIAN if n_rim > 0 else 0.0
     used = np.zeros(n, np.bool_)
-    mean, count = np.zeros(k), np.zeros(k)
+    mean, level_of, count = np.zeros(k), np.zeros(k), np.zeros(k)
     n_core, n_inner, core, inner, core_level, inner_level = 0, 0, 0.0, 0.0, 0.0, 0.0
     for j in range(k):
         for i in range(first[j], first[j + 1]):
@@ -59,6 +63,7 @@ def weights(s, residual, model, first, sigma, level, white, floor, parameters, o
             used[i] = True
             if s[i] > 3 * sigma:
                 mean[j] += square[i]
+                level_of[j] += model[i]
                 count[j] += 1.0
             elif s[i] < 0.0:
                 n_inner += 1
@@ -70,12 +75,19 @@ def weights(s, residual, model, first, sigma, level, white, floor, parameters, o
                     core_level += model[i]
     enough = count > 2 * parameters + 2
     if not np.any(enough):
-        return np.zeros(n), np.nan, np.nan, mean, count
-    v_out = max(np.median((mean / np.maximum(count - parameters, 1.0))[enough]), floor)
+        return np.zeros(n), np.nan, np.nan, mean, 1.0
     if n_core <= 20:
         n_core, core, core_level = n_inner, inner, inner_level
-    v_in, level_in = (core / n_core, core_level / n_core) if n_core > 0 else (v_out, white)
+    mean = mean / np.maximum(count - parameters, 1.0)
+    v_in, level_in = (core / n_core, core_level / n_core) if n_core > 0 else (np.median(mean[enough]), white)
     v_in = max(v_in, floor)
+    share = (level_of / np.maximum(count, 1.0) - level_in) / (level - level_in)
+    usual = np.sort(mean[enough])[np.sum(enough) // 4]
+    # What a sector's variance would be at the mean level of the background.
+    for j in range(k):
+        mean[j] /= min(max((v_in + (usual - v_in) * share[j]) / max(usual, 1e-300), 0.5), 2.0)
+    v_out, spread = _quiet(mean[enough], np.median(count[enough]))
+    v_out = max(v_out, floor)
     weight, chi2 = np.zeros(n), np.zeros(k)
     for j in range(k):
         for i in range(first[j], first[j + 1]):
@@ -84,8 +96,25 @@ def weights(s, residual, model, first, sigma, level, white, floor, parameters, o
                 weight[i] = 1.0 / max(v_in + (v_out - v_in) * x, min(v_in, v_out))
                 if s[i] > 3 * sigma:
                     chi2[j] += square[i] * weight[i]
-        chi2[j] /= max(count[j], 1.0)
-    return weight, v_in, v_out, chi2, count
+        chi2[j] = chi2[j] / max(count[j] - parameters, 1.0) - 1.0 if enough[j] else 0.0
+    return weight, v_in, v_out, chi2, spread
+
+
+@njit(cache=True)
+def _quiet(variance, n):  # type: ignore[no-untyped-def]
+    """(mean, relative spread) of the sectors' variances that belong together at their low end.
+
+    n: pixels of a sector.  A holder's edges add to a sector's variance and never take any away.
+    """
+    ordered = np.sort(variance)
+    m = ordered.shape[0]
+    low, quarter = ordered[m // 10], ordered[m // 4]
+    spread = max(math.sqrt(2.0 / n), min((quarter - low) / (0.607 * max(quarter, 1e-300)), 0.5))
+    middle = quarter * (1.0 + 0.67 * spread)
+    for _ in range(4):
+        kept = ordered[ordered < middle * (1.0 + 3.0 * spread)]
+        middle = np.mean(kept)
+    return middle, spread
 
 
 def correlation(u: Array, v: Array, normalised: Array, per_parameter: float) -> Array:
@@ -93,33 +122,29 @@ def correlation(u: Array, v: Array, normalised: Array, per_parameter: float) -> 
 
     per_parameter: pixels per fitted parameter; a fit takes its reciprocal away from every lag.
     """
-    grid = _grid(u, v, normalised)
-    rho, count = _lags(grid)
-    rho, count = rho / rho[REACH, REACH], np.maximum(count, 1)
-    rho = rho * count[REACH, REACH] / count
-    white = np.zeros_like(rho)
+    white = np.zeros((2 * REACH + 1, 2 * REACH + 1))
     white[REACH, REACH] = 1.0
-    corrected = rho + 1.0 / per_parameter
-    neighbour = max(abs(corrected[REACH, REACH + 1]), abs(corrected[REACH + 1, REACH]))
-    if not neighbour > max(SIGNIFICANT / np.sqrt(count[REACH, REACH + 1]), SMALLEST):
+    grid = _grid(u, v, normalised)
+    near, count = _correlation(grid, 1, per_parameter)
+    neighbour = max(abs(near[1, 2]), abs(near[2, 1]))
+    if not neighbour > max(SIGNIFICANT / math.sqrt(max(count[1, 2], 1.0)), SMALLEST):
         return white
-    corrected[REACH, REACH] = 1.0
-    return np.asarray(corrected)
+    rho, _ = _correlation(grid, REACH, per_parameter)
+    rho[REACH, REACH] = 1.0
+    return rho
+
+
+def _correlation(grid: Array, reach: int, per_parameter: float) -> tuple[Array, Array]:
+    total, count = _lags(grid, reach)
+    count = np.maximum(count, 1.0)
+    return (total / count) / (total[reach, reach] / count[reach, reach]) + 1.0 / per_parameter, count
 
 
 def sandwich(u: Array, v: Array, influence: Array, rho: Array) -> Array:
     """Covariance (m, m) of estimates with influence (n, m), in units of a pixel's own noise, under correlation rho."""
-    out = np.zeros((influence.shape[1], influence.shape[1]))
     grids = [_grid(u, v, influence[:, k], fill=0.0) for k in range(influence.shape[1])]
-    for dv in range(-REACH, REACH + 1):
-        for du in range(-REACH, REACH + 1):
-            weight = rho[dv + REACH, du + REACH]
-            if weight == 0.0:
-                continue
-            for i, a in enumerate(grids):
-                shifted = np.roll(a, (dv, du), axis=(0, 1))
-                for j, b in enumerate(grids):
-                    out[i, j] += weight * float((shifted * b).sum())
+    spread = [convolve(grid, rho, mode="constant") for grid in grids]
+    out = np.array([[float((a * b).sum()) for b in grids] for a in spread])
     return (out + out.T) / 2
 
 
@@ -132,18 +157,19 @@ def _grid(u: Array, v: Array, values: Array, fill: float = np.nan) -> Array:
 
 
 @njit(cache=True)
-def _lags(grid):  # type: ignore[no-untyped-def]
-    size = 2 * REACH + 1
+def _lags(grid, reach):  # type: ignore[no-untyped-def]
+    """(sum of products, number of pairs), both (2 reach + 1, 2 reach + 1), of values that lie so many px apart."""
+    size = 2 * reach + 1
     total, count = np.zeros((size, size)), np.zeros((size, size))
-    for j in range(REACH, grid.shape[0] - REACH):
-        for i in range(REACH, grid.shape[1] - REACH):
+    for j in range(reach, grid.shape[0] - reach):
+        for i in range(reach, grid.shape[1] - reach):
             here = grid[j, i]
             if np.isnan(here):
                 continue
-            for dv in range(-REACH, REACH + 1):
-                for du in range(-REACH, REACH + 1):
+            for dv in range(-reach, reach + 1):
+                for du in range(-reach, reach + 1):
                     there = grid[j + dv, i + du]
                     if not np.isnan(there):
-                        total[dv + REACH, du + REACH] += here * there
-                        count[dv + REACH, du + REACH] += 1.0
+                        total[dv + reach, du + reach] += here * there
+                        count[dv + reach, du + reach] += 1.0
     return total, count

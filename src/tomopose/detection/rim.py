@@ -9,7 +9,18 @@ import numpy.typing as npt
 
 from tomopose.detection.cholesky import solve
 from tomopose.detection.cone import by_sector, cone_angle, cone_coordinates, cone_eccentricity, ring_pixels
-from tomopose.detection.edges import FIRST_NODE, N_SHAPE, SHAPE, WHITE, model_rows, normal_equations, with_priors
+from tomopose.detection.edges import (
+    FIRST_NODE,
+    N_SHAPE,
+    SHAPE,
+    SHELL_EDGES,
+    SHELLS,
+    WHITE,
+    gradient,
+    model_rows,
+    normal_equations,
+    with_priors,
+)
 from tomopose.detection.profile import edge_profile
 from tomopose.errors import BallNotFoundError
 from tomopose.geometry.scanner import Scanner
@@ -22,6 +33,8 @@ MANY, NEAR = 8000, 8.0
 LINEAR = 0.02
 """Largest move, px, after which distances are updated to first order: what is left out is LINEAR^2 / 2 radius."""
 STAY = np.zeros(3)
+FLAT = 5.0
+"""Distance from the rim, in widths of the blur, from which the edge is over."""
 SMALLEST_BLUR, LARGEST_STEP = 0.25, 2.0
 
 
@@ -45,6 +58,7 @@ class Rim:
         self.box_u, self.box_v = box - box.mean()
         self.precision = np.zeros(3 * self.n_nodes)
         self.kappa_start, self.white_prior = 1.0, (0.0, 0.0)
+        self.shells, self.turned = SHELLS, False
         self._sums: tuple[Array, Array, Array] | None = None
         pixels = 2 * math.pi * radius * (self.inside + self.outside)
         self.every = 5 if pixels > 5 * ENOUGH else 3 if pixels > 3 * ENOUGH else 1
@@ -54,9 +68,10 @@ class Rim:
         """Takes the pixels of the ring about the current silhouette, one in `every`, and places the angular nodes."""
         u, v, value, rim = self.ring(self.good, -self.inside, self.outside, self.every)
         thin_from = NEAR if u.size > MANY and self.every == 1 else self.outside
-        self.u, self.v, self.value, self.rim, self.left, self.share, self.first = by_sector(
-            u, v, value, rim, -self.inside, self.outside, thin_from, self.n_nodes
+        self.u, self.v, self.value, self.rim, self.left, self.share, self.bounds = by_sector(
+            u, v, value, rim, -self.inside, self.outside, thin_from, self.n_nodes, np.array(SHELL_EDGES)
         )
+        self.first = self.bounds[::SHELLS]
         n = self.u.size
         if n < 4 * self.n_nodes:
             at = f"({self.shape[0]:.1f}, {self.shape[1]:.1f})"
@@ -101,16 +116,43 @@ class Rim:
     def residual(self) -> Array:
         return self.value - self.model
 
+    def use_shells(self, n: int) -> None:
+        """Gives the pixels beyond the first n shells no weight."""
+        self.shells = n
+        self.weight = np.where(self.rim[0] < SHELL_EDGES[n - 1], self.weight, 0.0)
+
+    def columns(self, shell: int) -> npt.NDArray[np.intp]:
+        """Rows of the Jacobian that count in a shell: far from the rim an edge's width and height do not."""
+        opaque = math.isinf(self.shape[4])
+        use = np.ones(FIRST_NODE + 6, dtype=bool)
+        use[4], use[5:7] = not opaque, self.turned
+        if shell > 0 and opaque and SHELL_EDGES[0] > FLAT * self.shape[3]:
+            use[[3, 5, 6, WHITE]] = False
+        return np.flatnonzero(use)
+
+    def shell_sums(self, low: int, high: int) -> tuple[Array, Array]:
+        """Normal matrix and right side of all parameters, without priors, of the shells from low to before high."""
+        N, g = normal_equations(
+            self.value, self.model, self.jacobian, self.bounds, self.weight, self.columns(low), low, high
+        )
+        return N, g
+
     def sums(self) -> tuple[Array, Array]:
-        """Normal matrix and right side of all parameters without priors; kept until the model or a weight changes."""
+        """Normal matrix and right side without priors; kept until the model or a weight changes."""
         if self._sums is None or self._sums[0] is not self.weight:
-            both = normal_equations(self.value, self.model, self.jacobian, self.first, self.weight)
-            self._sums = (self.weight, *both)
+            N, g = self.shell_sums(0, 1)
+            if self.shells > 1 and self.bounds[-1] > 0:
+                N_far, g_far = self.shell_sums(1, self.shells)
+                N, g = N + N_far, g + g_far
+            self._sums = (self.weight, N, g)
         return self._sums[1], self._sums[2]
 
     def normal(self, active: npt.NDArray[np.intp]) -> tuple[Array, Array]:
         """Normal matrix and right side of the active parameters, priors included."""
-        N, g = self.sums()
+        return self.with_priors(*self.sums(), active)
+
+    def with_priors(self, N: Array, g: Array, active: npt.NDArray[np.intp]) -> tuple[Array, Array]:
+        """Rows and columns `active` of N and g, priors added."""
         precision, pull = np.zeros(g.size), np.zeros(g.size)
         if math.isfinite(self.shape[4]):
             precision[4] = 1.0 / self.kappa_start**2
@@ -122,6 +164,18 @@ class Rim:
         precision[FIRST_NODE:] = self.precision
         pull[FIRST_NODE:] = self.precision * (centre - self.nodes).ravel()
         return with_priors(N, g, precision, pull, active)
+
+    def polish(self, active: npt.NDArray[np.intp], *, careful: bool) -> None:
+        """Steps to the optimum near by; with one normal matrix, only the right side following, unless `careful`."""
+        for _ in range(3 if careful else 4):
+            N = self.sums()[0]
+            if self.step(active, careful=careful) < 1e-4:
+                return
+            if not careful:
+                g = gradient(
+                    self.value, self.model, self.jacobian, self.bounds, self.weight, self.columns(0), self.shells
+                )
+                self._sums = (self.weight, N, g)
 
     def step(self, active: npt.NDArray[np.intp], *, careful: bool = False) -> float:
         """One Gauss-Newton step, shortened while it makes the fit worse if `careful`.
@@ -138,7 +192,7 @@ class Rim:
         if not np.isfinite(full).all():
             raise BallNotFoundError("the rim does not determine a ball (no finite step)")
         before = (self.shape, self.white, self.nodes)
-        cost = self.cost
+        cost = self.cost if careful else 0.0
         self._move(full, active)
         while careful and self.cost > cost and np.abs(full[:3]).max() > 1e-3:
             full = full / 3
