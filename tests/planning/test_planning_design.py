@@ -10,8 +10,9 @@ from tomopose.calibration.solve import calibrate
 from tomopose.errors import InputError, NotObservableError, OutOfReachError
 from tomopose.geometry.projection import project_ball
 from tomopose.observations import BallObservations
-from tomopose.planning.design import nominal_mount, plan_poses, predicted_covariance
+from tomopose.planning.design import SIGMA_PX, nominal_mount, plan_poses, predicted_covariance
 from tomopose.planning.limits import PlanLimits, allowed, candidates
+from tomopose.planning.resolve import resolvability
 from tomopose.planning.target import scan_target
 from tomopose.trajectory.feasibility import TravelLimits, travel
 from tomopose.trajectory.pose_grid import pose_grid
@@ -46,9 +47,22 @@ def test_all_but_the_true_symmetries_are_resolved(turned_plan):
 def test_the_still_table_needs_at_most_72_and_says_what_stays_hidden(paper_scanner):
     plan = plan_poses(paper_scanner, t=BALL, n=72)
     assert plan.predicted <= plan.reference
-    assert {h.name for h in plan.resolved.unresolved} <= {
+    assert {h.name for h in plan.resolved.unresolved} == {
         "half a pixel low", "half a pixel high", "pixels counted from 1",
     }
+    assert "another table angle" in plan.resolved.words[0]
+    assert "half a pixel" in plan.resolved.words[0]
+
+
+def test_few_images_are_chosen_so_that_rivals_show(paper_scanner):
+    """Eight images chosen for the scan alone would let half a pixel pass; the plan takes poses that show it."""
+    plan = plan_poses(paper_scanner, t=BALL, n=8, limits=TURNED)
+    alone = plan_poses(paper_scanner, t=BALL, n=8, limits=TURNED, resolve=False)
+    hidden = resolvability(paper_scanner, alone.poses, T_HT=nominal_mount(), t=BALL, sigma=SIGMA_PX)
+    assert {h.name for h in hidden.unresolved} == {"half a pixel low", "half a pixel high"}
+    assert plan.resolved.unresolved == ()
+    assert plan.predicted < 1.25 * alone.predicted
+    assert "5 sigma" in plan.resolved.words[0]
 
 
 def test_the_first_pose_is_repeated_and_limits_hold(turned_plan, paper_scanner):

@@ -184,12 +184,15 @@ def poses(
         elif purpose == "rigid":
             plan = best_poses(geometry, images=images, goal=goal, **given)
             sequence = plan.poses
+            told = plan.resolved
             summary |= {"predicted_px": plan.predicted, "paper_189_px": plan.reference, "u": dict(plan.u),
-                        "duration_s": plan.duration}
+                        "duration_s": plan.duration, "not_shown": [h.name for h in told.unresolved],
+                        "symmetries": [h.name for h in told.symmetric]}
             lines.append(
                 f"  predicted scan reprojection error {plan.predicted:.4f} px (the paper's 189 poses: "
                 f"{plan.reference:.4f} px), about {plan.duration / 60:.0f} minutes"
             )
+            lines += [f"  {words}" for words in told.words]
         else:
             raise typer.BadParameter(f"{purpose!r} is neither rigid nor kinematic", param_hint="--for")
     else:

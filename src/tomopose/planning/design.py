@@ -20,7 +20,7 @@ from tomopose.manipulator.poses import PoseSequence
 from tomopose.planning.exchange import Chosen, Criterion, exchange
 from tomopose.planning.limits import PlanLimits, candidates
 from tomopose.planning.order import ordered, rows_of, run_time
-from tomopose.planning.resolve import Resolvability, resolvability
+from tomopose.planning.resolve import Resolvability, exact_problem, resolvability, telling
 from tomopose.planning.target import ScanTarget, scan_target
 from tomopose.trajectory.pose_grid import pose_grid
 from tomopose.trajectory.tilt import R_HT_MOUNTED
@@ -33,6 +33,7 @@ BALL_MM = (10.0, -8.0, 16.0)
 """A ball 20 mm off the pivot in no special direction: on the pivot, rotations could not be told from one another."""
 
 MOST_IMAGES = 400
+RESOLVING_ROUNDS = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +131,8 @@ def plan_poses(
                (default: the paper's tilted scan, eq. (11), and a box of +-15, +-15, +-30 mm).
     free, priors: scanner parameters to be estimated too, as in `calibrate`.
     criterion: "A": the scan reprojection error itself;  "D": the volume of the confidence region.
-    resolve:   also find which rival conventions the poses would show.
+    resolve:   also see to it that the poses show every rival convention that these limits let them show, by 5 sigma,
+               and find which they would not.
 
     Raises
     ------
@@ -151,25 +153,48 @@ def plan_poses(
         predicted_covariance(scanner, pose_grid(3), T_HT=T_HT, t=ball, sigma=sigma)
     )
 
+    must: list[int] = []
+
     def choose(k: int) -> Chosen:
         """k images, one pose among them twice: the first, which the run ends with."""
-        best = exchange(L, k, M=target.M, N_0=prior, criterion=criterion, seed=seed)
+        held = must[: k // 2]
+        best = exchange(L, k, M=target.M, N_0=prior, criterion=criterion, seed=seed, fixed=held)
         if len(np.unique(best.index)) < k:
             return best
-        fewer = exchange(L, k - 1, M=target.M, N_0=prior, criterion=criterion, seed=seed)
+        fewer = exchange(L, k - 1, M=target.M, N_0=prior, criterion=criterion, seed=seed, fixed=held)
         index = np.append(fewer.index, fewer.index[0])
         N = np.einsum("kia,kib->ab", L[index], L[index]) + prior
         return Chosen(index=index, covariance=inverse_information(N), value=np.nan)
 
-    most = _largest_affordable(limits)
-    if n is not None:
-        chosen = choose(_checked(n, most))
-    else:
-        chosen = _fewest(choose, target, reference if goal is None else goal, most, len(prior))
-    poses = ordered(rows_of(pool, chosen.index), limits)
-    while limits.total_time is not None and run_time(poses, limits) > limits.total_time and len(poses) > len(prior):
-        chosen = choose(len(poses) - max(1, len(poses) // 20))
+    def design() -> tuple[PoseSequence, Chosen]:
+        most = _largest_affordable(limits)
+        if n is not None:
+            chosen = choose(_checked(n, most))
+        else:
+            chosen = _fewest(choose, target, reference if goal is None else goal, most, len(prior))
         poses = ordered(rows_of(pool, chosen.index), limits)
+        while limits.total_time is not None and run_time(poses, limits) > limits.total_time and len(poses) > len(prior):
+            chosen = choose(len(poses) - max(1, len(poses) // 20))
+            poses = ordered(rows_of(pool, chosen.index), limits)
+        return poses, chosen
+
+    poses, chosen = design()
+    resolved = None
+    if resolve:
+        given: dict[str, Any] = {"T_HT": T_HT, "t": ball, "sigma": sigma}
+        resolved = resolvability(scanner, poses, **given)
+        everything = exact_problem(scanner, pool, **given)
+        for _ in range(RESOLVING_ROUNDS):
+            more = telling(everything, chosen.index, resolved.unresolved, max(2, len(poses) // 8))
+            if not more or 2 * len(must) > len(poses):
+                break
+            must += more
+            other, other_chosen = design()
+            better = resolvability(scanner, other, **given)
+            # poses forced in for a rival that they do not help against only cost accuracy
+            if better.score <= resolved.score and _least(better) <= 1.1 * _least(resolved):
+                break
+            poses, chosen, resolved = other, other_chosen, better
     covariance = predicted_covariance(scanner, poses, T_HT=T_HT, t=ball, sigma=sigma, free=freed)
     names = tangent_names((0,), freed)
     return PosePlan(
@@ -178,9 +203,14 @@ def plan_poses(
         reference=reference,
         u=dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
         covariance=covariance,
-        resolved=resolvability(scanner, poses, T_HT=T_HT, t=ball, sigma=sigma) if resolve else None,
+        resolved=resolved,
         duration=run_time(poses, limits),
     )
+
+
+def _least(resolved: Resolvability) -> float:
+    """The smallest rise of chi2 by a rival that is not told."""
+    return min((h.delta for h in resolved.unresolved), default=np.inf)
 
 
 def _checked(n: int, most: int) -> int:
