@@ -194,9 +194,7 @@ def memory(frames_in_all: int) -> None:
         for _ in range(frames_in_all):
             yield image.copy()
 
-    predicted = np.tile([2000.4, 1900.7], (frames_in_all, 1))
-    seen = detect(frames(), scanner, predicted=predicted, workers=1).seen.sum()
-    detect([image], scanner)
+    seen = detect(frames(), scanner, workers=1).seen.sum()
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
     print(f"{peak:.0f} MiB ({after_setup:.0f} before the first frame), {seen} seen")
 

@@ -131,7 +131,8 @@ def fit_cone(
         rim.step(active, careful=kappa_free)
     noise = _weigh(rim, floor, 2.5)
     rim.polish(active, careful=kappa_free)
-    doubt = nearer(rim, active, careful=kappa_free)
+    rho = _noise_correlation(rim, noise)
+    doubt = nearer(rim, active, careful=kappa_free, noise=max(float(rho.sum()), 1.0))
     anisotropy, anisotropy_covariance = _anisotropy(rim, shape)
     significance = float(anisotropy @ np.linalg.solve(anisotropy_covariance, anisotropy))
     if significance > 30.0 and np.hypot(*anisotropy) > 0.1 * rim.shape[3] ** 2:
@@ -140,7 +141,7 @@ def fit_cone(
         for _ in range(3):
             rim.step(active)
         anisotropy = rim.shape[5:7].copy()
-    return _result(rim, shape, active, noise, doubt, anisotropy, anisotropy_covariance)
+    return _result(rim, shape, active, noise, rho, doubt, anisotropy, anisotropy_covariance)
 
 
 def _approach(rim: Rim, spread: float) -> None:
@@ -249,6 +250,15 @@ def _weigh(rim: Rim, floor: float, parameters: float) -> _Noise:
     return _Noise(inside=v_in, outside=v_out, excess=excess, scatter=scatter)
 
 
+def _noise_correlation(rim: Rim, noise: _Noise) -> Array:
+    """Autocorrelation of the noise where the background is fitted well."""
+    well = (noise.excess < MISFIT * noise.scatter)[rim.left]
+    outside = np.flatnonzero((rim.rim[0] > 3 * rim.shape[3]) & (rim.weight > 0) & well)
+    if outside.size <= 200:
+        return np.ones((1, 1))
+    return correlation(rim.u[outside], rim.v[outside], (rim.residual * np.sqrt(rim.weight))[outside])
+
+
 def _curvature_precision(rim: Rim, active: npt.NDArray[np.intp]) -> Array:
     """Empirical Bayes: 1 / tau_k^2, where most nodes share one small tau and few, at a holder's edges, have their own.
 
@@ -292,6 +302,7 @@ def _result(
     shape: tuple[str, ...],
     active: npt.NDArray[np.intp],
     noise: _Noise,
+    rho: Array,
     doubt: Array,
     anisotropy: Array,
     anisotropy_covariance: Array,
@@ -303,11 +314,7 @@ def _result(
     block = (rows[:, :m] + rows[:, :m].T) / 2
     s, sigma = rim.rim[0], rim.shape[3]
     clean = (rim.weight > 0) & (noise.excess < MISFIT * noise.scatter)[rim.left]
-    outside = (s > 3 * sigma) & (rim.weight > 0) & (noise.excess <= np.median(noise.excess))[rim.left]
     normalised = rim.residual * np.sqrt(rim.weight)
-    rho = correlation(
-        rim.u[outside], rim.v[outside], normalised[outside], max(outside.sum() / (1.5 * rim.n_nodes), 3.0)
-    ) if outside.sum() > 200 else np.ones((1, 1))
     if np.count_nonzero(rho) > 1:
         effect = influence(rim.jacobian, rim.left, rim.weight, _scattered(rim, active, rows), rim.n_nodes)
         block = sandwich(rim.u, rim.v, effect, rho)

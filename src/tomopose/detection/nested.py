@@ -22,8 +22,11 @@ REMAINING = 0.5
 """Share of D D' that is added to the covariance of the smaller ring, for what its own background leaves out."""
 
 
-def nearer(rim: Rim, active: npt.NDArray[np.intp], *, careful: bool) -> Array:
-    """Leaves the rim fitted on the largest ring that agrees with those inside it; (2, 2) to add to the covariance."""
+def nearer(rim: Rim, active: npt.NDArray[np.intp], *, careful: bool, noise: float) -> Array:
+    """Leaves the rim fitted on the largest ring that agrees with those inside it; (2, 2) to add to the covariance.
+
+    noise: variance of a sum of pixels over that of as many independent ones, for correlated noise.
+    """
     sizes = [n for n in range(1, SHELLS + 1) if n == 1 or rim.outside > SHELL_EDGES[n - 2]]
     if len(sizes) == 1:
         return np.zeros((2, 2))
@@ -41,7 +44,7 @@ def nearer(rim: Rim, active: npt.NDArray[np.intp], *, careful: bool) -> Array:
         covariances.append((X[:2, :2] + X[:2, :2].T) / 2)
     chosen = len(sizes) - 1
     while chosen > 0 and any(
-        _chi2(steps[n] - steps[chosen], covariances[n] - covariances[chosen]) > IMPLAUSIBLE for n in range(chosen)
+        _chi2(steps[n] - steps[chosen], covariances[n] - covariances[chosen]) > IMPLAUSIBLE * noise for n in range(chosen)
     ):
         chosen -= 1
     if chosen == len(sizes) - 1:

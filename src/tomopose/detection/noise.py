@@ -10,8 +10,8 @@ from scipy.ndimage import convolve
 
 from tomopose.units import Array
 
-REACH = 4
-"""Largest lag, px, at which correlation is looked for: a scintillator's or an interpolation's."""
+REACH = 5
+"""Lag, px, at which noise no longer counts as correlated: a scintillator's or an interpolation's ends before."""
 SIGNIFICANT = 5.0
 """Standard deviations by which a neighbour's correlation must differ from 0 before noise counts as correlated."""
 SMALLEST = 0.06
@@ -117,27 +117,34 @@ def _quiet(variance, n):  # type: ignore[no-untyped-def]
     return middle, spread
 
 
-def correlation(u: Array, v: Array, normalised: Array, per_parameter: float) -> Array:
+def correlation(u: Array, v: Array, normalised: Array) -> Array:
     """Autocorrelation (2 REACH + 1, 2 REACH + 1) of normalised residuals at pixels u, v; a delta where it is white.
 
-    per_parameter: pixels per fitted parameter; a fit takes its reciprocal away from every lag.
+    A fit takes as much away from every lag (and from the variance) as residuals at a distance of REACH are
+    correlated, where the noise itself is not.
     """
-    white = np.zeros((2 * REACH + 1, 2 * REACH + 1))
-    white[REACH, REACH] = 1.0
+    rho = np.zeros((2 * REACH + 1, 2 * REACH + 1))
+    rho[REACH, REACH] = 1.0
     grid = _grid(u, v, normalised)
-    near, count = _correlation(grid, 1, per_parameter)
+    near, count = _correlation(grid, 1)
     neighbour = max(abs(near[1, 2]), abs(near[2, 1]))
     if not neighbour > max(SIGNIFICANT / math.sqrt(max(count[1, 2], 1.0)), SMALLEST):
-        return white
-    rho, _ = _correlation(grid, REACH, per_parameter)
-    rho[REACH, REACH] = 1.0
+        return rho
+    rho, count = _correlation(grid, REACH)
+    rim = np.ones(rho.shape, dtype=bool)
+    rim[1:-1, 1:-1] = False
+    rho += max(-float(np.average(rho[rim], weights=count[rim])), 0.0)
+    # Autocorrelations of correlated noise vary by sqrt(sum rho^2 / n) themselves.
+    chance = math.sqrt(float((near**2).sum()) / count[REACH, REACH])
+    rho[(np.abs(rho) < 2.0 * chance) | rim] = 0.0
     return rho
 
 
-def _correlation(grid: Array, reach: int, per_parameter: float) -> tuple[Array, Array]:
+def _correlation(grid: Array, reach: int) -> tuple[Array, Array]:
+    """Autocorrelation and the number of pairs, both (2 reach + 1, 2 reach + 1)."""
     total, count = _lags(grid, reach)
     count = np.maximum(count, 1.0)
-    return (total / count) / (total[reach, reach] / count[reach, reach]) + 1.0 / per_parameter, count
+    return (total / count) / (total[reach, reach] / count[reach, reach]), count
 
 
 def sandwich(u: Array, v: Array, influence: Array, rho: Array) -> Array:
