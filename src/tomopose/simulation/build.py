@@ -132,7 +132,7 @@ def _spectrum(scene: S.Scene, materials: Mapping[str, Material]) -> Spectrum:
                 f"{detector.response}: the response covers {energy[0]:g} to {energy[-1]:g} keV, the spectrum "
                 f"{spectrum.energy[0]:g} to {spectrum.energy[-1]:g} keV"
             )
-        return Spectrum(energy=spectrum.energy, weight=spectrum.weight * np.interp(spectrum.energy, energy, response))
+        return replace(spectrum, weight=spectrum.weight * np.interp(spectrum.energy, energy, response))
     return spectrum.absorbed_energy(detector.scintillator, detector.thickness_mm, materials)
 
 

@@ -35,6 +35,8 @@ STAGE_TO_M = np.diag([-1.0, -1.0, 1.0])
 """The stage's axes are W's turned by 180 degrees about w."""
 SIGMA_PER_RESOLUTION = 2 * math.sqrt(math.log(5) / 2) / math.pi
 """sigma of a Gaussian over its basic spatial resolution b: modulation 20 % at 1 / (2 b) (ISO 19232-5)."""
+ANODE_DENSITY = 10.0
+"""g/cm3 of an anode whose material is not in the table: no spectrum depends on it."""
 NOT_READ = (
     ("source", "spectrum", "file"),
     ("source", "spot", "intensity_map"),
@@ -221,8 +223,8 @@ def _detector(content: Mapping[str, Any], scanner: Scanner) -> Detector:
 def run_to_ctsimu(run: SimulatedRun) -> tuple[dict[str, Any], dict[str, Mesh]]:
     """(scenario content, mesh files by name): geometry by the true poses, meshes in M, tessellated where analytic.
 
-    The voltage is the spectrum's highest energy; a run does not keep filters apart from the tube, so that the
-    scenario names none: a reader who needs them finds them in the scene.
+    Tube, filters and scintillator are named where the run knows them; a spectrum from a table has its highest energy
+    for a voltage, and a response from a table is left out.
     """
     home = eq5_matrices(run.scanner, T_HT=run.T_HT, T_MH=run.T_MH, alpha=np.asarray(run.poses.alpha))
     matrices = ProjectionMatrices(
@@ -256,11 +258,10 @@ def run_to_ctsimu(run: SimulatedRun) -> tuple[dict[str, Any], dict[str, Mesh]]:
             }
         )
     content["samples"] = samples
-    content["materials"] = [_material_entry(name, run.materials[name]) for name in run.beam_materials]
-    content["source"] |= {
-        "voltage": {"value": float(run.spectrum.energy[-1]), "unit": "kV"},
-        "spectrum": {"monochromatic": False, "file": None},
-    }
+    materials = {name: run.materials[name] for name in run.beam_materials}
+    source, scintillator = _source_entry(run.spectrum, run.materials, materials)
+    content["source"] |= source
+    content["materials"] = [_material_entry(name, material) for name, material in materials.items()]
     if run.spot.shape == "gaussian":
         content["source"]["spot"] = {
             "sigma": {
@@ -271,6 +272,7 @@ def run_to_ctsimu(run: SimulatedRun) -> tuple[dict[str, Any], dict[str, Mesh]]:
     d = run.detector
     content["detector"] |= {
         "type": "real",
+        **scintillator,
         "bit_depth": {"value": d.bits},
         "image_lag": {"value": sum(d.lag)},
         "gray_value": {"imin": {"value": d.dark}, "imax": {"value": d.white}},
@@ -280,6 +282,32 @@ def run_to_ctsimu(run: SimulatedRun) -> tuple[dict[str, Any], dict[str, Mesh]]:
         },
     }
     return content, files
+
+
+def _source_entry(
+    spectrum: Spectrum, known: Mapping[str, Material], named: dict[str, Material]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """(source, scintillator) of a scenario; what they are made of joins `named`."""
+
+    def plate(part: tuple[Material | str, float]) -> dict[str, Any]:
+        material, thickness = part
+        name = material if isinstance(material, str) else f"material-{len(named)}"
+        named[name] = known[name] if isinstance(material, str) else material
+        return {"material_id": name, "thickness": {"value": thickness, "unit": "mm"}}
+
+    voltage = float(spectrum.energy[-1]) if spectrum.tube is None else spectrum.tube.voltage
+    source: dict[str, Any] = {
+        "voltage": {"value": voltage, "unit": "kV"},
+        "spectrum": {"monochromatic": False, "file": None},
+        "filters": [plate(part) for part in spectrum.filters],
+    }
+    if spectrum.tube is not None:
+        anode = spectrum.tube.anode
+        named[anode] = known[anode] if anode in known else from_formula(anode, ANODE_DENSITY)
+        angle = {"emission": {"value": spectrum.tube.anode_angle_deg, "unit": "deg"}}
+        source["target"] = {"type": "reflection", "material_id": anode, "angle": angle}
+    part = spectrum.scintillator
+    return source, {} if part is None else {"scintillator": plate(part)}
 
 
 def _material_entry(name: str, material: Material) -> dict[str, Any]:

@@ -7,18 +7,17 @@ projector's rays.  How it starts without a screen is told in docs/concepts/virtu
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from tomopose.errors import EngineFailedError, EngineMissingError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.simulation.mesh import Mesh
+from tomopose.simulation.spectrum import Beam
 from tomopose.simulation.view import View, Window
 from tomopose.units import Array
-
-if TYPE_CHECKING:
-    from tomopose.simulation.run import SimulatedRun
 
 TILE = 512
 """Side of the images asked for: textures of the software renderer stop at 2048."""
@@ -34,7 +33,7 @@ def _engine() -> Any:
         from gvxrPython3 import gvxr
     except ImportError as error:
         raise EngineMissingError(
-            'engine = "gvxr" needs gvxr, which is not installed', install_line="pip install gvxr"
+            'engine = "gvxr" needs gvxr, which is not installed', install_line='pip install "tomopose[gvxr]"'
         ) from error
     try:
         # It tells its start-up story to the terminal unless it is given another place.
@@ -88,19 +87,24 @@ def path_images(
 def add_gvxr_transmission(
     out: Any,
     window: Window,
-    run: SimulatedRun,
+    bodies: list[tuple[Mesh, str, Frame]],
+    materials: tuple[str, ...],
+    beam: Beam,
     view: View,
     T_FW: dict[Frame, RigidTransform],
     *,
     f: int,
     weight: float = 1.0,
 ) -> None:
-    """Add weight x transmission at the middle of each cell to out[0]; see `projector.add_transmission`."""
-    bodies = [(T_FW[frame].apply(mesh.vertices), mesh.faces) for mesh, _, frame in run.tessellated]
+    """Add weight x transmission at the middle of each cell to out[0]; see `projector.add_transmission`.
+
+    bodies: meshes with their material and frame; materials: names of the beam's columns.
+    """
+    placed = [(T_FW[frame].apply(mesh.vertices), mesh.faces) for mesh, _, frame in bodies]
     first = 0.5 / f - 0.5
-    paths = path_images(bodies, view, window.u_0 + first, window.v_0 + first, 1 / f, window.n_u * f, window.n_v * f)
-    L = np.zeros((*paths.shape[1:], len(run.beam_materials)))
-    for path, (_, material, _) in zip(paths, run.tessellated, strict=True):
-        L[..., run.beam_materials.index(material)] += path
+    paths = path_images(placed, view, window.u_0 + first, window.v_0 + first, 1 / f, window.n_u * f, window.n_v * f)
+    L = np.zeros((*paths.shape[1:], len(materials)))
+    for path, (_, material, _) in zip(paths, bodies, strict=True):
+        L[..., materials.index(material)] += path
     for j in range(len(L)):
-        out[0, j] += weight * run.beam.transmission(L[j])
+        out[0, j] += weight * beam.transmission(L[j])

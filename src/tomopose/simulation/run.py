@@ -172,7 +172,9 @@ def transmission(run: SimulatedRun, i: int, *, threads: int = 1) -> Array:
     for view, T_FW in views:
         share: dict[str, Any] = {"f": f, "weight": 1 / len(views), "threads": threads}
         if run.engine == "gvxr":
-            add_gvxr_transmission(cells, window, run, view, T_FW, f=f, weight=1 / len(views))
+            add_gvxr_transmission(
+                cells, window, run.tessellated, run.beam_materials, run.beam, view, T_FW, f=f, weight=1 / len(views)
+            )
         elif run.meshes:
             add_mesh_transmission(
                 cells, window, run.compiled, run.meshes, run.beam_materials, run.beam, view, T_FW, **share

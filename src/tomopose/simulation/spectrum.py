@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,11 +24,26 @@ CONDENSED_ERROR = 1e-5
 
 
 @dataclass(frozen=True, kw_only=True)
+class Tube:
+    """Voltage (kV), material and angle (deg) of the anode."""
+
+    voltage: float
+    anode: str
+    anode_angle_deg: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Spectrum:
-    """energy (n,), keV; weight (n,), relative: photons, or what a detector makes of them."""
+    """energy (n,), keV; weight (n,), relative: photons, or what a detector makes of them.
+
+    Where it comes from, as far as it is known: tube, filters and scintillator (material, mm).
+    """
 
     energy: Array
     weight: Array
+    tube: Tube | None = None
+    filters: tuple[tuple[Material | str, float], ...] = ()
+    scintillator: tuple[Material | str, float] | None = None
 
     def __post_init__(self) -> None:
         energy, weight = float_array(self.energy), float_array(self.weight)
@@ -52,10 +67,8 @@ class Spectrum:
         """Behind a plate of that material and thickness (mm)."""
         if not thickness >= 0:
             raise InputError(f"filter {material}: thickness is {thickness} mm; it may not be negative")
-        return Spectrum(
-            energy=self.energy,
-            weight=self.weight * np.exp(-attenuation(material, self.energy, materials=materials) * thickness),
-        )
+        passed = np.exp(-attenuation(material, self.energy, materials=materials) * thickness)
+        return replace(self, weight=self.weight * passed, filters=(*self.filters, (material, thickness)))
 
     def absorbed_energy(
         self, material: Material | str, thickness: float, materials: Mapping[str, Material] = MATERIALS
@@ -64,7 +77,7 @@ class Spectrum:
         if not thickness > 0:
             raise InputError(f"scintillator: thickness is {thickness} mm; a positive number is needed")
         absorbed = 1 - np.exp(-attenuation(material, self.energy, materials=materials) * thickness)
-        return Spectrum(energy=self.energy, weight=self.weight * absorbed * self.energy)
+        return replace(self, weight=self.weight * absorbed * self.energy, scintillator=(material, thickness))
 
 
 def tube_spectrum(voltage: float, *, anode: str = "W", anode_angle_deg: float = 12.0) -> Spectrum:
@@ -73,11 +86,12 @@ def tube_spectrum(voltage: float, *, anode: str = "W", anode_angle_deg: float = 
     Tungsten at 12 degrees and 100, 120 or 180 kV comes with the package (made by spekpy); everything else asks spekpy.
     """
     names, values = table("tungsten")
+    tube = Tube(voltage=voltage, anode=anode, anode_angle_deg=anode_angle_deg)
     column = f"W_{voltage:g}kV"
     if anode == "W" and anode_angle_deg == 12.0 and column in names:
         weight = values[:, names.index(column)]
         keep = weight > 0
-        return Spectrum(energy=values[keep, 0], weight=weight[keep])
+        return Spectrum(energy=values[keep, 0], weight=weight[keep], tube=tube)
     try:
         import spekpy
     except ImportError as error:
@@ -92,7 +106,7 @@ def tube_spectrum(voltage: float, *, anode: str = "W", anode_angle_deg: float = 
     except Exception as error:
         raise InputError(f"spekpy gives no spectrum for {anode} at {voltage:g} kV: {error}") from error
     keep = (weight > 0) & (energy >= 6.0)
-    return Spectrum(energy=energy[keep], weight=weight[keep])
+    return Spectrum(energy=energy[keep], weight=weight[keep], tube=tube)
 
 
 @dataclass(frozen=True, kw_only=True)
