@@ -72,7 +72,7 @@ def test_held_out_poses_as_if_refitted() -> None:
     """The closed form of cross-validation against honest refits."""
     e = hexapod_experiment(HEXAPOD, "mixed", 0)
     problem, start = problem_of(e, HEXAPOD)
-    fit = fit_model(problem, start, resize=False)
+    fit = fit_model(problem, start)
     said = judge("kinematic", fit)
     n = len(e.poses)
     squares, log_predictive = 0.0, 0.0

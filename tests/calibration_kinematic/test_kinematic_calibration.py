@@ -110,7 +110,7 @@ def test_backlash_and_drift_do_not_ruin_it(kind: str, worn: dict[str, float]) ->
     lag = cal.manipulator["lag"]
     assert lag["names"] == [name for name in cal.tangent if name.startswith("lag_")]
     assert not any("lag_" in name for name in cal.manipulator["names"]), "wear is told apart from the geometry"
-    assert cal.manipulator["scatter"]["t_mm"] > 0.0006, "what the run drifted may come again"
+    assert max(cal.manipulator["scatter"]["t_mm"]) > 0.0006, "what the run drifted may come again"
     assert any("drifted" in reason for reason in cal.reasons)
 
 

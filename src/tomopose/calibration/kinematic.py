@@ -218,7 +218,7 @@ def _with_run_effects(problem: KinematicProblem, fit: ModelFit) -> ModelFit:
     more = np.zeros(len(model.names) - len(machine.names))
     start = replace(estimate.state, p=np.concatenate([estimate.state.p, more]))
     try:
-        other = fit_model(replace(problem, model=model), start, keep=fit.keep, resize=False)
+        other = fit_model(replace(problem, model=model), start, keep=fit.keep)
     except NotConvergedError:
         return fit
     return replace(other, size=fit.size) if other.estimate.log_evidence > estimate.log_evidence + EVIDENCE_GAIN else fit

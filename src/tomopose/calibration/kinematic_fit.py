@@ -14,6 +14,7 @@ from tomopose.calibration.robust import LARGEST_SHARE, MEDIAN_CHI2_2, RECLASSIFI
 from tomopose.calibration.uncertainty import WIDENING_PROBABILITY
 from tomopose.errors import NotConvergedError
 from tomopose.manipulator.pose_map import PoseMap
+from tomopose.manipulator.run_effects import WithRunEffects
 from tomopose.units import Array
 
 SCATTER_STEPS = 12
@@ -107,12 +108,12 @@ def with_scatter(estimate: MapEstimate) -> MapEstimate:
 
 
 def with_size(estimate: MapEstimate) -> tuple[MapEstimate, float]:
-    """The estimate with the priors' sizes taken from the data where that is clearly better than the stated ones.
+    """(estimate, largest factor): with the priors' sizes from the data where that is clearly better than the stated.
 
     MacKay's rule for each group of errors that one cause makes: s^2 = sum (p/sigma)^2 / gamma, gamma the number of
-    errors of the group that the data determine.  A map's sizes are nowhere stated, so they are always taken; its turns
-    keep their proportion to the shifts of the same group where the data do not determine them.  Returns the largest
-    factor too.
+    errors of the group that the data determine.  A map's sizes and those of a run's effects are nowhere stated, so they
+    are always taken; a map's turns keep their proportion to the shifts of the same group where the data do not
+    determine them.
     """
     model = estimate.problem.model
     if model is None or not (model.groups >= 0).any():
@@ -135,14 +136,14 @@ def with_size(estimate: MapEstimate) -> tuple[MapEstimate, float]:
             break
         sizes = sizes * change
         now = solve_map(replace(now.problem, model=model.resized(sizes)), now.state)
-    if isinstance(model, PoseMap):
+    if isinstance(model, (PoseMap, WithRunEffects)):
         return now, 1.0
     taken = now.log_evidence > estimate.log_evidence + SIZE_GAIN
     return (now, float(sizes.max())) if taken else (estimate, 1.0)
 
 
 def fit_model(
-    problem: KinematicProblem, start: State, *, robust: bool = True, resize: bool = True, keep: Any = None
+    problem: KinematicProblem, start: State, *, robust: bool = True, keep: Any = None
 ) -> ModelFit:
     """The optimum of a model from a start, with scatter and size from the data.
 
@@ -156,7 +157,7 @@ def fit_model(
     else:
         estimate = solve_softened(problem if keep.all() else problem.rows(keep), start)
     estimate = with_scatter(estimate)
-    estimate, size = with_size(estimate) if resize else (estimate, 1.0)
+    estimate, size = with_size(estimate)
     if size > 1.0 and estimate.problem.scatter > 1.0:
         # what looked like scatter may have been errors larger than stated
         quiet = with_scatter(solve_softened(replace(estimate.problem, scatter=1.0), estimate.state))

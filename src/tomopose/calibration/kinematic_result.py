@@ -70,13 +70,16 @@ def _parameters(fit: ModelFit) -> tuple[Parameter, ...]:
     return tuple(result)
 
 
-def scatter_block(fit: ModelFit) -> dict[str, float]:
-    """Standard deviations of the plate from pose to pose: its scatter, and the run's drift, which a scan may repeat."""
+def scatter_block(fit: ModelFit) -> dict[str, list[float]]:
+    """Standard deviations of the plate from pose to pose, along H: its scatter, and the run's drift, which a scan may
+    repeat."""
     problem = fit.estimate.problem
     variance = problem.scatter * problem.repeatability.variance
     if isinstance(problem.model, WithRunEffects):
-        variance = variance + problem.model.drift_variance(problem.poses, fit.estimate.state.p)
-    return {"t_mm": float(np.sqrt(variance[3:].mean())), "w_rad": float(np.sqrt(variance[:3].mean()))}
+        p = fit.estimate.state.p
+        C = fit.estimate.covariance[-len(p) :, -len(p) :]
+        variance = variance + problem.model.drift_variance(problem.poses, p, C)
+    return {"t_mm": np.sqrt(variance[3:]).tolist(), "w_rad": np.sqrt(variance[:3]).tolist()}
 
 
 def calibration_of(

@@ -105,7 +105,7 @@ def scatter_of(calibration: Calibration) -> Array:
     """(6,) variance of (w, t) of the plate from pose to pose, rad^2 and mm^2; 0 where it is not known."""
     found = calibration.manipulator.get("scatter")
     if found is not None:
-        return np.repeat([float(found["w_rad"]) ** 2, float(found["t_mm"]) ** 2], 3)
+        return np.concatenate([np.broadcast_to(np.asarray(found[name]) ** 2, 3) for name in ("w_rad", "t_mm")])
     noise = calibration.extra.get("pose_noise", {"rotation_rad": 0.0, "translation_mm": 0.0})
     return np.repeat([float(noise["rotation_rad"]) ** 2, float(noise["translation_mm"]) ** 2], 3)
 

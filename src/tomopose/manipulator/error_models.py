@@ -4,7 +4,7 @@
 
     {"kind": "hexapod" | "serial" | "map",  "nominal": the machine as in its file,
      "names", "values", "units", "u": of its errors,
-     "scatter": {"t_mm", "w_rad"} of the plate from pose to pose, with the drift that the run showed,
+     "scatter": {"t_mm", "w_rad"}, three each along H, of the plate from pose to pose, with the drift of the run,
      "lag": {"names", "values"} of worn guides and drives, where the run showed it: it follows the direction from which
      a table's poses are approached, in their order,
      "translation_scale": factor on the plate's shifts, where it was freed and is not 1,

@@ -36,6 +36,7 @@ class WithRunEffects:
 
     tau: pose id -> place in the run.  lags: pose id -> (6, k), the plate's motion by a unit lag of guides and drives.
     t_sigma (mm), w_sigma (rad): size of drift and lags.  lag_units: (k,) "mm" or "rad".
+    factors: on the size of the drift's turns and shifts, of the lags in rad and in mm.
     """
 
     machine: ErrorModel
@@ -44,6 +45,7 @@ class WithRunEffects:
     lag_units: tuple[str, ...]
     t_sigma: float = 0.005
     w_sigma: float = 20e-6
+    factors: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
 
     @property
     def kind(self) -> str:
@@ -61,9 +63,9 @@ class WithRunEffects:
 
     @property
     def sigma(self) -> Array:
-        one = np.repeat([self.w_sigma, self.t_sigma], 3)
-        lags = np.where(np.array(self.lag_units) == "mm", self.t_sigma, self.w_sigma)
-        return np.concatenate([self.machine.sigma, np.tile(one, DRIFT_ORDER), lags])
+        group = self.groups[len(self.machine.names) :]
+        size = np.tile([self.w_sigma, self.t_sigma], 2) * self.factors
+        return np.concatenate([self.machine.sigma, size[group]])
 
     @property
     def repeatability(self) -> Repeatability:
@@ -94,17 +96,26 @@ class WithRunEffects:
         m = len(self.machine.names)
         return slice(m, m + DRIFT_ORDER * len(COORDINATES))
 
-    def drift_variance(self, poses: PoseSequence, p: Array) -> Array:
-        """(6,) rad^2, mm^2: how far the drift moved the plate in this run, about its mean."""
-        k = DRIFT_ORDER * len(COORDINATES)
-        return np.var(self._effects(poses)[:, :, :k] @ p[self.drift], axis=0)
+    def drift_variance(self, poses: PoseSequence, p: Array, covariance: Array) -> Array:
+        """(6,) rad^2, mm^2: the expected square by which the drift moved the plate in this run, about its mean.
+
+        covariance (m, m) of p: what is not known of the drift counts too.
+        """
+        J = self._effects(poses)[:, :, : DRIFT_ORDER * len(COORDINATES)]
+        J = J - J.mean(axis=0)
+        second = np.outer(p[self.drift], p[self.drift]) + covariance[self.drift, self.drift]
+        return np.asarray(np.einsum("nia,ab,nib->i", J, second, J) / len(poses))
 
     @property
     def groups(self) -> Any:
-        return np.concatenate([self.machine.groups, np.full(len(self.names) - len(self.machine.names), -1)])
+        """The machine keeps its sizes; drift and lags take theirs from the run, turns and shifts apart."""
+        drift = np.tile(np.repeat([0, 1], 3), DRIFT_ORDER)
+        lags = np.where(np.array(self.lag_units) == "mm", 3, 2)
+        return np.concatenate([np.full(len(self.machine.names), -1), drift, lags])
 
     def resized(self, sizes: Array) -> WithRunEffects:
-        return replace(self, machine=self.machine.resized(sizes))
+        f = np.asarray(self.factors) * sizes
+        return replace(self, factors=(float(f[0]), float(f[1]), float(f[2]), float(f[3])))
 
     def to_json(self) -> dict[str, Any]:
         return self.machine.to_json()
