@@ -9,7 +9,8 @@ from tomopose.errors import InputError
 from tomopose.simulation.materials import MATERIALS, Material, attenuation, from_formula
 from tomopose.simulation.spectrum import CONDENSED_ERROR, Spectrum, condense, tube_spectrum
 
-# Hubbell and Seltzer, NISTIR 5632 (physics.nist.gov/xaamdi): mass attenuation coefficients, cm2/g.
+# Mass attenuation coefficients, cm2/g: Hubbell and Seltzer, NISTIR 5632 (NIST Standard Reference Database 126,
+# physics.nist.gov/xaamdi); C, Al and Cu compared with its pages as github.com/ehsteve/roentgen keeps them.
 ENERGY = (20.0, 30.0, 40.0, 50.0, 60.0, 80.0, 100.0, 150.0, 200.0)
 NIST = {
     "C": (0.4420, 0.2562, 0.2076, 0.1871, 0.1753, 0.1610, 0.1514, 0.1347, 0.1229),
