@@ -19,6 +19,7 @@ from tomopose.simulation.specimen import specimen_mesh
 from tomopose.simulation.standard import BASE_TOP, multi_sphere_standard, sphere_centres, sphere_diameters
 from tomopose.studies import section6
 from tomopose.studies.demo import demo_setup
+from tomopose.studies.section6_calibrations import planned_run
 from tomopose.studies.section6_paths import ball_paths, fine_matrices, mesh_paths
 from tomopose.studies.section6_scan import MOUNTED, WHITE, Numbers, Radiographs, grid_of, scan_with, specimen
 from tomopose.studies.section6_specimen import cylinder_areas, reference, true_lengths, unseen_by_circle
@@ -135,6 +136,16 @@ def test_waves_and_verdicts():
     assert "better" in verdict(10.0, 5.0)
     assert "WORSE" in verdict(5.0, 10.0)
     np.testing.assert_allclose(limit([0.0, 50.0]), [MPE_A_UM, MPE_A_UM + 1.0])
+
+
+def test_our_run_has_as_many_poses_in_view_and_scatters_anew():
+    first, second = (planned_run(5.3, 3, number=k) for k in (1, 2))
+    assert len(first.poses) == 189
+    np.testing.assert_array_equal(first.poses.T_MH.t, second.poses.T_MH.t)
+    assert np.abs(first.T_MH.t - second.T_MH.t).max() > 1e-4  # mm
+    assert len(set(np.round(np.degrees(first.alpha)))) == 4
+    assert (first.x_D > 300).all()  # px: the ball's image is 212 px in radius
+    assert (first.x_D < 1750).all()
 
 
 def test_cases_have_names_of_their_own_and_order_is_looked_at_once():

@@ -20,8 +20,8 @@ from tomopose.reconstruction.reconstruct import reconstruct
 from tomopose.report.page import Figure
 from tomopose.report.style import ACCENT, ALERT, ORANGE, axis, layout
 from tomopose.studies.result import Progress, Scale, StudyCheck, StudyRow, check_below
+from tomopose.studies.section6_calibrations import kinematic, projected, rigid
 from tomopose.studies.section6_tables import PRINTED_CYLINDER_UM
-from tomopose.studies.section6_volumes import DETECTION_PX, both_methods
 from tomopose.studies.steps import Steps
 from tomopose.studies.virtual_hexapod import ball_run, real_T_MH, scan_of
 from tomopose.trajectory.scan import circular_scan
@@ -92,8 +92,10 @@ def surface_deviation(volume: Volume) -> Array:
         x = np.stack([np.full((ANGLES, r.size), z), np.outer(np.sin(phi), r), np.outer(np.cos(phi), r)])
         index = (x - grid.origin[::-1, None, None]) / grid.spacing[::-1, None, None]
         profile = map_coordinates(values, index, order=1)
-        level = profile[:, : r.size // 4].mean() / 2
-        below = profile < level
+        quarter = r.size // 4
+        # Local: views in sequence leave other values on one side than on the other.
+        level = (profile[:, :quarter].mean(axis=1) + profile[:, -quarter:].mean(axis=1)) / 2
+        below = profile < level[:, None]
         if not below.any(axis=1).all() or below[:, 0].any():
             raise InputError(f"the volume shows no edge of the cylinder at z = {z:g} mm")
         k, rows = np.argmax(below, axis=1), np.arange(ANGLES)
@@ -114,8 +116,8 @@ def matrices_of(scale: Scale, seed: int) -> tuple[dict[str, tuple[Any, Any, str]
     binning, views = PLAN[scale]
     run = ball_run(MAGNIFICATION, 3, seed, number=1)
     rng = np.random.default_rng(np.random.SeedSequence([seed, 12]))
-    sigma = DETECTION_PX / np.sqrt(2)
-    found = both_methods(run, run.x_D + sigma * rng.standard_normal(run.x_D.shape), sigma, MAGNIFICATION)
+    seen = projected(run, rng)
+    paper, best = rigid(run, seen), kinematic(run, seen, MAGNIFICATION)
     scan, circle = scan_of(MAGNIFICATION, views), circular_scan(views)
     fine = run.scanner
 
@@ -127,8 +129,8 @@ def matrices_of(scale: Scale, seed: int) -> tuple[dict[str, tuple[Any, Any, str]
     tilted, round_ = true(scan, real_T_MH(scan, MAGNIFICATION)), true(circle, circle.T_MH)
     return {
         "circular scan": (round_, round_, "golden"),
-        "3D scan, paper's method": (tilted, projection_matrices(found["paper"], scan, binning=binning), "golden"),
-        "3D scan, our best": (tilted, projection_matrices(found["best"], scan, binning=binning), "golden"),
+        "3D scan, paper's method": (tilted, projection_matrices(paper, scan, binning=binning), "golden"),
+        "3D scan, our best": (tilted, projection_matrices(best, scan, binning=binning), "golden"),
         "circular scan, sequential order": (round_, round_, "sequential"),
     }, fine.binned(binning)
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from tomopose.studies.result import Progress, Scale
+from tomopose.studies.section6_calibrations import GRID, calibrations
 from tomopose.studies.section6_figures import figures_of
 from tomopose.studies.section6_scan import MAGNIFICATION, Numbers, Object, Path, Radiographs, scan_with
 from tomopose.studies.section6_specimen import measure_specimen, reference
@@ -18,7 +19,7 @@ from tomopose.studies.section6_tables import (
     specimen_rows,
     standard_rows,
 )
-from tomopose.studies.section6_volumes import GRID, calibrations, cases_of, matrices_for, measured
+from tomopose.studies.section6_volumes import cases_of, matrices_for, measured
 from tomopose.studies.steps import Steps
 from tomopose.studies.virtual_hexapod import ball_run, scan_error_um
 from tomopose.trajectory.completeness import source_path
@@ -47,9 +48,11 @@ NOTES = (
     "The hexapod is the virtual one of study table2, whose errors leave the paper's residuals, with its scatter from "
     "pose to pose in the measurement scans too. It is calibrated before (run 1) and after (run 2) the scan. The "
     "circular scan does not move it and has the scanner's own matrices, taken as exact.",
-    "By the paper's method: rigid calibration, one iteration of SART with relaxation 0.8 from zero, views in random "
-    "order (the paper does not print its order). By our best: kinematic calibration, FDK and one iteration of SART in "
-    "golden order, which is the default. Both see the same radiographs, and are measured alike.",
+    "By the paper's method: 189 poses of its grid, rigid calibration, one iteration of SART with relaxation 0.8 from "
+    "zero, views in random order (the paper does not print its order). By our best: 189 mixed poses at four table "
+    "angles, kinematic calibration, FDK and one iteration of SART in golden order, which is the default. Both "
+    "reconstruct the same radiographs, and are measured alike. What the kinematic calibration makes of the paper's own "
+    "poses is in study table2.",
     "The paper prints few numbers here: most of its results are bars and colours. Only what stands in its text is "
     "repeated in the column of printed values.",
     "The specimen and the standard have the paper's kinds of feature and size; all their other measures are this "
@@ -92,7 +95,9 @@ def run_with(numbers: Numbers, seed: int, steps: Steps, progress: Progress) -> t
         m = MAGNIFICATION[thing]
         solved = {}
         for number in numbers.runs[thing]:
-            both = solved[number] = calibrations(m, number, numbers, seed, steps, part)
+            both = solved[number] = calibrations(
+                m, number, radiographs=numbers.radiographs, seed=seed, steps=steps, progress=part
+            )
             truth = ball_run(m, GRID, seed, number=number)
             residuals[m, number] = (both["paper"].d_rms, both["best"].d_rms)
             errors[m, number] = (scan_error_um(both["paper"], truth, m), scan_error_um(both["best"], truth, m))

@@ -1,33 +1,24 @@
-"""From calibration runs to volumes: each scan of sec. 6 reconstructed by the paper's method and by ours."""
+"""From calibrations to volumes: each scan of sec. 6 reconstructed by the paper's method and by ours."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from tomopose.calibration.apply import projection_matrices
 from tomopose.calibration.result import Calibration
-from tomopose.calibration.solve import calibrate
 from tomopose.geometry.projection import ProjectionMatrices
-from tomopose.observations import BallObservations
 from tomopose.reconstruction.reconstruct import PAPER, reconstruct
-from tomopose.studies.hexapod_runs import solve_run
-from tomopose.studies.radiographs import BallRun
 from tomopose.studies.result import Progress
+from tomopose.studies.section6_calibrations import Method
 from tomopose.studies.section6_scan import WHITE, Numbers, Object, Path, Radiographs, Scan, grid_of
 from tomopose.studies.steps import Steps
-from tomopose.studies.table1 import PRINTED
-from tomopose.studies.virtual_hexapod import ball_run, believed_hexapod
 from tomopose.volume import Volume
 
-Method = Literal["paper", "best"]
-DETECTION_PX = PRINTED[5.3, 3][1]
-"""Table 1, row 5: d_rms_exact of the paper's detection at M 5.3; both coordinates together."""
-GRID = 3
 CHECKPOINT_SECONDS = 300.0
 
 
@@ -59,30 +50,6 @@ def cases_of(thing: Object, runs: tuple[int, ...]) -> tuple[Case, ...]:
     if thing == "standard":
         cases += [Case(thing=thing, path="3D", method="best", run=1, order=o) for o in ("sequential", "golden")]
     return tuple(cases)
-
-
-def both_methods(run: BallRun, x_D: Any, sigma: float, magnification: float) -> dict[Method, Calibration]:
-    """Rigid, as the paper, and kinematic calibration from the same centres (n, 2), px, with one sigma a coordinate."""
-    seen = BallObservations.from_sigma(x_D, sigma, pose_id=run.poses.pose_id)
-    return {
-        "paper": calibrate(run.scanner, run.poses, seen, model="rigid", robust=False, hypotheses=False,
-                           pose_noise=None),
-        "best": calibrate(run.scanner, run.poses, seen, manipulator=believed_hexapod(magnification),
-                          model="kinematic", hypotheses=False),
-    }
-
-
-def calibrations(
-    magnification: float, number: int, numbers: Numbers, seed: int, steps: Steps, progress: Progress
-) -> dict[Method, Calibration]:
-    """Calibration run `number` of the virtual hexapod, by both methods."""
-    if numbers.radiographs:
-        solved = solve_run(magnification, GRID, seed, number, steps, progress)
-        return {"paper": solved.paper_method, "best": solved.best}
-    run = ball_run(magnification, GRID, seed, number=number)
-    rng = np.random.default_rng(np.random.SeedSequence([seed, 61, round(10 * magnification), number]))
-    sigma = DETECTION_PX / np.sqrt(2)
-    return both_methods(run, run.x_D + sigma * rng.standard_normal(run.x_D.shape), sigma, magnification)
 
 
 def matrices_for(case: Case, scan: Scan, found: Mapping[int, Mapping[Method, Calibration]]) -> ProjectionMatrices:
