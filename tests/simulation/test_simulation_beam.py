@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tomopose.errors import InputError
+from tomopose.simulation.attenuate import attenuated
 from tomopose.simulation.materials import MATERIALS, Material, attenuation, from_formula
 from tomopose.simulation.spectrum import CONDENSED_ERROR, Spectrum, condense, tube_spectrum
 
@@ -68,6 +69,19 @@ def test_the_condensed_spectrum_transmits_what_the_full_one_does(rng):
     mu = np.stack([attenuation(n, spectrum.energy) for n in names], axis=1)
     full = np.exp(-L @ mu.T) @ (spectrum.weight / spectrum.weight.sum())
     assert np.abs(beam.transmission(L) - full).max() < 3 * CONDENSED_ERROR
+
+
+def test_kernels_attenuate_as_the_sum_does(rng):
+    spectrum = tube_spectrum(120.0).filtered("Cu", 0.5).absorbed_energy("CsI", 0.6)
+    beam = condense(spectrum, ("PEEK", "Al", "WC-Co"), (12.0, 40.0, 8.0))
+    L = rng.random((300, 3)) * [60.0, 90.0, 12.0]
+    # One material: the table.  Several: the sum.
+    alone = np.concatenate([np.outer(L[:, m], np.eye(3)[m]) for m in range(3)])
+    for paths, limit in ((alone, 2e-9), (L, 2e-9), (1e-3 * L, 2e-9)):
+        mine = np.array([attenuated(beam.arrays, row) for row in paths])
+        assert np.abs(mine - beam.transmission(paths)).max() < limit
+    assert attenuated(beam.arrays, np.zeros(3)) == 1.0
+    assert attenuated(beam.arrays, np.array([0.0, 0.0, 1e4])) == 0.0
 
 
 @pytest.mark.parametrize(

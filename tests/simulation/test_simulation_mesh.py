@@ -11,11 +11,13 @@ from tomopose import PoseSequence, RigidTransform, Scanner
 from tomopose.errors import EngineFailedError, FileError, InputError
 from tomopose.geometry.frames import Frame
 from tomopose.simulation.mesh import Mesh, MeshSolid, mesh_paths, read_mesh, write_stl
+from tomopose.simulation.raster import mesh_path_image
 from tomopose.simulation.rays import path_lengths
 from tomopose.simulation.run import simulate_ball_run, transmission
 from tomopose.simulation.shapes import Solid, box, cone, cylinder, half_space, sphere, torus
 from tomopose.simulation.specimen import LENGTH, measurands, specimen_mesh
 from tomopose.simulation.tessellate import tessellate
+from tomopose.simulation.view import View, Window
 
 pytest.importorskip("embreex")
 pytest.importorskip("manifold3d")
@@ -68,6 +70,61 @@ def test_rays_through_edges_and_corners_of_a_cube(rng):
     exact = path_lengths([Solid(shape=box(2, 2, 2), material="Al")], o, d)[:, 0]
     np.testing.assert_allclose(L, exact, atol=2e-3)
     assert np.abs(L - exact)[exact > 0.1].max() < 1e-6
+
+
+def test_drawn_triangles_are_the_rays_paths(rng):
+    scanner = Scanner(d_SD=800.0, d_SR=200.0, p_u=0.4, p_v=0.5, u_0=41.0, v_0=38.0, n_u=83, n_v=77, eta=0.1, theta=0.05)
+    view, window = View.of(scanner), Window(u_0=-3, v_0=2, n_u=81, n_v=70)
+    u, v = np.meshgrid(window.u_0 + np.arange(81), window.v_0 + np.arange(70))
+    d = (view.O + u[..., None] * view.U + v[..., None] * view.V - view.source).reshape(-1, 3)
+    # Straight in the beam, the cube's sides meet the principal ray's row and column exactly.
+    for turn in (RigidTransform.from_angles([0.3, -0.5, 1.1], [1.0, 0.7, -0.4], source=Frame.M, target=Frame.W),
+                 RigidTransform.identity(Frame.M, Frame.W)):
+        for mesh in (CUBE, ball(4)):
+            solid = MeshSolid(mesh=mesh, material="Al")
+            image = mesh_path_image((solid,), view, {Frame.M: turn}, window, threads=2)
+            back = turn.inv
+            L = mesh_paths(solid, back.apply(view.source), d @ back.R.T).reshape(70, 81)
+            assert image.max() > 1.9
+            # No ray slips through: none ends negative or as long as the way to the object.
+            assert image.min() > -1e-9
+            assert (np.abs(image - L) > 1e-7).mean() < 0.002
+            assert np.abs(image - L).max() < 0.1
+
+
+def test_rays_through_corners_of_a_mesh_never_slip_through():
+    # Every sample of the grid lies on an edge or a corner of a mesh whose corners are the grid's own.
+    view = View(source=np.zeros(3), O=np.array([-4.0, -4.0, 8.0]), U=np.array([1.0, 0, 0]), V=np.array([0, 1.0, 0]))
+    x, y = np.meshgrid(np.arange(9.0) - 4, np.arange(9.0) - 4)
+    low = np.stack([x, y, np.full_like(x, 8.0)], axis=-1).reshape(-1, 3)
+    a = np.arange(72).reshape(8, 9)[:, :8].ravel()
+    quads = np.stack([a, a + 1, a + 10, a + 9], axis=1)
+    rim = [*range(9), *range(17, 81, 9), *range(79, 71, -1), *range(63, 0, -9)]
+    near = np.concatenate([quads[:, [0, 2, 1]], quads[:, [0, 3, 2]]])
+    walls = [[p, q, q + 81] for p, q in zip(rim, rim[1:] + rim[:1], strict=True)]
+    walls += [[p, q + 81, p + 81] for p, q in zip(rim, rim[1:] + rim[:1], strict=True)]
+    mesh = Mesh(vertices=np.concatenate([low, 1.25 * low]), faces=np.concatenate([near, near[:, ::-1] + 81, walls]))
+    image = mesh_path_image((MeshSolid(mesh=mesh, material="Al", frame=Frame.W),), view,
+                            {Frame.W: RigidTransform.identity(Frame.W)}, Window(u_0=0, v_0=0, n_u=9, n_v=9))
+    exact = 0.25 * np.linalg.norm(low, axis=1).reshape(9, 9)
+    np.testing.assert_allclose(image[1:-1, 1:-1], exact[1:-1, 1:-1], rtol=1e-12)
+    on_rim = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+    assert ((on_rim == 0) | (on_rim > 1.9)).all()
+
+
+def test_the_edge_of_a_mesh_lies_where_the_shape_s_does():
+    scanner = Scanner(d_SD=800.0, d_SR=200.0, p_u=0.4, p_v=0.5, u_0=61.3, v_0=48.7, n_u=121, n_v=97)
+    mount = RigidTransform.from_angles([0.1, 0.2, 3.0], [0.2, 0.1, 0.3], source=Frame.H, target=Frame.T)
+    solids = (Solid(shape=box(7, 6, 5), material="WC-Co"),)
+    run = simulate_ball_run(scanner, T_HT=mount, t=np.zeros(3), poses=PoseSequence.from_table([[0, 0, 0]], [[0, 0, 0]]),
+                            solids=solids)
+    ((mesh, material, frame),) = tessellate(solids)
+    meshed = replace(run, solids=(), meshes=(MeshSolid(mesh=mesh, material=material, frame=frame),))
+    a, b = transmission(run, 0), transmission(meshed, 0)
+    slope = np.hypot(*np.gradient(a))
+    steep = slope > 0.25 * slope.max()
+    assert (np.abs(a - b) / np.maximum(slope, 1e-12))[steep].max() < 0.004
+    assert np.sqrt(((a - b)[steep] / slope[steep] @ ((a - b)[steep] / slope[steep])) / steep.sum()) < 0.0007
 
 
 def test_open_and_inverted_meshes_are_refused():

@@ -74,6 +74,11 @@ def test_the_schema_names_every_key_and_is_json():
     assert "blur_sigma_px" in schema["$defs"]["DetectorPart"]["properties"]
 
 
+def test_the_published_schema_is_the_model_s():
+    published = SCENES.parents[1] / "docs/formats/scene.schema.json"
+    assert json.loads(published.read_text(encoding="utf-8")) == json.loads(json.dumps(scene_schema()))
+
+
 @pytest.mark.parametrize(
     ("document", "words"),
     [
