@@ -96,10 +96,22 @@ class Diagnosis:
         return self.named("same")
 
     @property
+    def leading(self) -> tuple[Hypothesis, ...]:
+        """The rival that fits best of those that fit better, and those that these poses cannot tell from it."""
+        if not self.better:
+            return ()
+        unit = {h.name: h.chi2 * self.better[0].dof / max(h.dof, 1) for h in self.better}
+        least = min(unit.values())
+        noise = max(1.0, least / max(self.better[0].dof, 1))
+        return tuple(h for h in self.better if unit[h.name] - least < SAME * noise)
+
+    @property
     def advice(self) -> tuple[str, ...]:
         """Sentences: what to change, what cannot be told.  Nothing is changed by itself."""
-        lines = [f"{h.words}: fits better (delta chi2 {h.delta:.3g}); to try: {h.cure}" for h in self.better]
-        told = [h.name for h in self.same if not h.symmetry]
+        lines = [f"{h.words}: fits better (delta chi2 {h.delta:.3g}); to try: {h.cure}" for h in self.leading]
+        if len(lines) > 1:
+            lines.append("these readings fit equally well; these poses cannot tell them apart from one another")
+        told = [] if lines else [h.name for h in self.same if not h.symmetry]
         if told:
             lines.append(f"cannot be told apart with these poses: {', '.join(told)}")
         kept = [h.name for h in self.same if h.symmetry]

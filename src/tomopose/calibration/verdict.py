@@ -61,8 +61,10 @@ def verdict(f: Findings) -> tuple[str, tuple[str, ...]]:
     rejected: list[str] = []
     doubtful: list[str] = []
     if not f.converged:
-        rejected.append("no optimum was reached")
-    for h in f.diagnosis.better if f.diagnosis else ():
+        rejected.append(
+            "no optimum was reached: a convention or the scanner's values are wrong; tomopose diagnose tries others"
+        )
+    for h in f.diagnosis.leading if f.diagnosis else ():
         much = h.factor > MUCH_BETTER
         (rejected if much else doubtful).append(
             f"a rival convention fits significantly better: {h.words} (delta chi2 {h.delta:.3g}, limit {-BETTER:g}; "

@@ -98,6 +98,7 @@ def calibrate(
         require_free_folder,
         write_calibration_folder,
     )
+    from tomopose.errors import NotConvergedError
     from tomopose.provenance import provenance
 
     either(images, observations)
@@ -117,10 +118,16 @@ def calibrate(
             dark=dark, flat=flat, dataset=dataset, rows=rows, raw=raw,
         )
         observed = observe(say, geometry, stack, sequence, ball_diameter=ball_diameter, workers=workers)
-    result = tp.calibrate(
-        geometry, sequence, observed, manipulator=errors, model=model, free=names(free), fix=names(fix),
-        distances=bars,
-    )
+    try:
+        result = tp.calibrate(
+            geometry, sequence, observed, manipulator=errors, model=model, free=names(free), fix=names(fix),
+            distances=bars,
+        )
+    except NotConvergedError as error:
+        # what was reached is rejected, and its report says why
+        if not isinstance(error.calibration, tp.Calibration):
+            raise
+        result = error.calibration
     given = [scanner, poses, *(p for p in (observations, manipulator) if p is not None)]
     made = provenance(
         inputs=given,

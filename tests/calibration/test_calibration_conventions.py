@@ -1,0 +1,61 @@
+"""A wrong convention written into the files is named by the command line, with the line that would cure it."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+STUDY = Path(__file__).resolve().parents[2] / "benchmarks" / "trust" / "conventions.py"
+
+
+@pytest.fixture(scope="module")
+def study():
+    spec = importlib.util.spec_from_file_location("trust_conventions", STUDY)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["trust_conventions"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def ran(study, folder, name, *, still=False):
+    rng = np.random.default_rng(3)
+    options = study.write(folder, study.MISTAKES[name](study.files(rng, still=still), rng))
+    code, said = study.command(["diagnose", *options])
+    code_c, calibrated = study.command(["calibrate", *options, "--out", str(folder / "cal"), "--force"])
+    return code, said, code_c, calibrated
+
+
+@pytest.mark.parametrize(
+    "name", ["rows flipped", "order ZYX", "y and z exchanged", "pairing lag +3", "half a pixel low"]
+)
+def test_the_true_cause_is_named_and_the_calibration_refused(study, tmp_path, name):
+    code, said, code_c, calibrated = ran(study, tmp_path, name)
+    assert code == 3
+    assert said["leading"] == [name]
+    cure = next(h["cure"] for h in said["hypotheses"] if h["name"] == name)
+    assert cure
+    assert cure in said["advice"][0]
+    assert code_c == 3
+    assert calibrated["verdict"] in ("rejected", "doubtful")
+
+
+def test_what_cannot_be_told_is_said(study, tmp_path):
+    code, said, code_c, _ = ran(study, tmp_path, "order ZYX", still=True)
+    assert code == code_c == 0
+    assert next(h["outcome"] for h in said["hypotheses"] if h["name"] == "order ZYX") == "same"
+    told = next(line for line in said["advice"] if line.startswith("cannot be told apart"))
+    assert "order ZYX" in told
+
+
+def test_readings_that_fit_equally_well_are_named_together(study, tmp_path):
+    """With the table still and the ball turned by single axes, transposed rotations are angles of the other sign."""
+    code, said, _, _ = ran(study, tmp_path, "rotation inverted", still=True)
+    assert code == 3
+    assert {"rotation inverted", "sign of UVW"} <= set(said["leading"])
+    assert any("one another" in line for line in said["advice"])
