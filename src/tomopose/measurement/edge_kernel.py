@@ -153,6 +153,19 @@ def _fit_edge(g: Any, sigma: Any, window: Any, start: Any, a: Any, b: Any, out: 
     out[S_VARIANCE] = (h22 * h33 - h23 * h23) / det
     out[S_BY_A], out[S_BY_B], out[S_VARIANCE_HELD] = -h12 / h11, -h13 / h11, 1.0 / h11
     _judge(g, sigma, window, s_0, a, b, out)
+    # What of a step in sigma the edge's own three parameters would take up.
+    q1 = q2 = q3 = 0.0
+    for k in range(m):
+        t = -window + k * STEP - s_0
+        phi = 0.5 * math.erfc(t / width)
+        slope = (a - b) * math.exp(-0.5 * (t / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi))
+        q1 += slope * slope * t / sigma
+        q2 += phi * slope * t / sigma
+        q3 += (1 - phi) * slope * t / sigma
+    c11, c12, c13 = h22 * h33 - h23 * h23, h13 * h23 - h12 * h33, h12 * h23 - h13 * h22
+    c22, c23, c33 = h11 * h33 - h13 * h13, h12 * h13 - h11 * h23, h11 * h22 - h12 * h12
+    out[D_SIGMA_2] -= (q1 * (c11 * q1 + c12 * q2 + c13 * q3) + q2 * (c12 * q1 + c22 * q2 + c23 * q3)
+                       + q3 * (c13 * q1 + c23 * q2 + c33 * q3)) / det
     return converged
 
 
@@ -227,6 +240,9 @@ def search_lines(c: Any, index: Any, step: Any, sigma: Any, window: Any, search:
                     break
             else:
                 result[i, S], result[i, A], result[i, B] = s, a, b
+                # The crossing moves with the level midway, along the slope of the blurred step.
+                result[i, S_BY_A] = -0.5 * sigma * math.sqrt(2 * math.pi) / (a - b)
+                result[i, S_BY_B] = result[i, S_BY_A]
                 _judge(g, sigma, window, s, a, b, result[i])
             shift = result[i, S]
             result[i, S] = middle + shift

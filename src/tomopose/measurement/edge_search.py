@@ -55,7 +55,7 @@ class EdgeSettings:
     contrast_threshold: share of the global contrast below which an edge is not believed.
     method:             esf: fit of a blurred step; local-50: 50 % between the plateaus.
     sigma:              standard deviation of the blur, mm; estimated from the edges where None.
-    plateau_radius:     neighbours within so many voxels share their plateaus (esf); 0 leaves each edge its own.
+    plateau_radius:     neighbours within so many voxels share their plateaus; 0 leaves each edge its own.
     """
 
     search_distance: float = 2.0
@@ -156,9 +156,7 @@ def search_edges(
         if progress is not None:
             progress(done + 1, len(starts))
     edges = _judged(result, flags, sigma, window, unit, settings, contrast)
-    if settings.method != "esf" or settings.plateau_radius == 0:
-        return edges
-    return _shared(edges, result, x, n, unit, settings.plateau_radius)
+    return edges if settings.plateau_radius == 0 else _shared(edges, result, x, n, unit, settings.plateau_radius)
 
 
 def _checked(points: Any, normals: Any) -> tuple[Array, Array]:
@@ -222,8 +220,7 @@ def _estimated_sigma(volume: Volume, index: Array, step: Array, settings: EdgeSe
         good &= contrast > 0.5 * np.median(contrast[good])
         good &= result[:, kernel.RMS] <= 3 * np.median(result[good, kernel.RMS]) + 1e-12 * np.abs(contrast)
         change = float(result[good, kernel.D_SIGMA].sum() / result[good, kernel.D_SIGMA_2].sum())
-        # The other three parameters follow sigma, which makes the plain step too short by about this factor.
-        sigma = float(np.clip(sigma + np.clip(1.5 * change, -0.5, 0.5), *SIGMA_RANGE))
+        sigma = float(np.clip(sigma + np.clip(change, -0.5, 0.5), *SIGMA_RANGE))
         if abs(change) < SIGMA_TOLERANCE:
             break
     return sigma

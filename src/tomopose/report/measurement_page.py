@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.errors import EngineMissingError
+from tomopose.measurement.budget import Budget
 from tomopose.measurement.comparison import Comparison
-from tomopose.measurement.contour import INSTALL_LINE
 from tomopose.measurement.results import MeasurementResult, MeasurementResults
+from tomopose.report.deviation_picture import vik_scale
 from tomopose.report.page import (
     BAD,
     CARE,
@@ -53,6 +53,7 @@ def measurement_report(
         Section(title="Errors", lead="Measured minus calibrated value, beside what is permitted.",
                 blocks=_errors(results)),
         Section(title="All results", blocks=[_rows(results), *_repeats(results)]),
+        *_budgets(results),
     ]
     for name, comparison in (comparisons or {}).items():
         sections.insert(1, _comparison(name, comparison, range_mm))
@@ -63,7 +64,7 @@ def measurement_report(
         Page(
             title=title, subtitle=f"{results.plan_name}: {n} volume{'s' if n > 1 else ''}",
             verdict=_verdict(results), key_figures=_keys(results), sections=sections,
-            footer="Written by tomopose. Intervals are 95 % of the fit's own scatter unless repeats are given.",
+            footer="Written by tomopose. Intervals of single results are 95 % of the fit's own scatter.",
         )
     )
 
@@ -112,6 +113,8 @@ def _errors(results: MeasurementResults) -> list[Block]:
         if rows:
             many = kind == "distance" and len(rows) > MANY * len(results.volumes)
             blocks.append(_by_length(words, rows, results.volumes) if many else _bars(words, rows, results.volumes))
+            if results.repeats() and not many:
+                blocks.append(_groups(words, rows, results))
     for kind, words in FORM_NAMES.items():
         rows = [r for r in results.results if r.kind == kind]
         if rows:
@@ -156,6 +159,34 @@ def _bars(
         if of_value else "Errors should be even in sign and stay inside the dashed limits.",
         data=data,
         layout=layout(xaxis=axis("", type="category"), yaxis=axis("µm"), barmode="group"), height=380,
+    )
+
+
+def _groups(words: str, rows: Sequence[MeasurementResult], results: MeasurementResults) -> Figure:
+    """Mean errors of the groups of repeats and of the volumes that stand alone, side by side (figs. 13 to 16)."""
+    names = list(dict.fromkeys(r.name for r in rows))
+    data: list[dict[str, Any]] = []
+    bars: dict[str, dict[str, tuple[float, float]]] = {}
+    for repeat in results.repeats():
+        if repeat.name in names and repeat.error is not None:
+            bars.setdefault(repeat.group, {})[repeat.name] = (repeat.error, repeat.s)
+    grouped = {v for group in results.groups.values() for v in group}
+    for r in rows:
+        if r.volume not in grouped and r.error is not None:
+            bars.setdefault(r.volume, {})[r.name] = (r.error, math.nan)
+    for k, (group, found) in enumerate(bars.items()):
+        spread = [0.0 if not math.isfinite(s) else s * MICROMETRES_PER_MM for _, s in found.values()]
+        data.append({
+            "type": "bar", "name": group, "x": list(found), "y": [e * MICROMETRES_PER_MM for e, _ in found.values()],
+            "marker": {"color": COLOURS[k % len(COLOURS)]},
+            "error_y": {"type": "data", "array": spread, "visible": any(spread), "thickness": 1.2},
+            "hovertemplate": "%{x}<br>%{y:.3f} µm<extra></extra>",
+        })
+    return Figure(
+        title=f"{words}: groups side by side",
+        meaning="Mean error of each group of repeats, with the standard deviation of one; volumes in no group alone.",
+        look_for="Groups that differ by more than their repeats scatter differ for a reason.",
+        data=data, layout=layout(xaxis=axis("", type="category"), yaxis=axis("µm"), barmode="group"), height=380,
     )
 
 
@@ -205,11 +236,36 @@ def _repeats(results: MeasurementResults) -> list[Block]:
         return []
     return [Table(
         title="Repeats",
-        meaning="All volumes taken as repeats of one measurement: U = 2 √(u_cal² + s²) + |mean error|.",
-        columns=["name", "n", "mean / mm", "s / µm", "mean error / µm", "U / µm"], numeric=(1, 2, 3, 4, 5),
-        rows=[[r.name, str(r.n), f"{r.mean:.5f}", _um(r.s), "–" if r.error is None else _um(r.error, True), _um(r.U)]
-              for r in found],
+        meaning="Groups of volumes that repeat one measurement: U = 2 √(u_cal² + s²) + |mean error|.",
+        columns=["group", "name", "n", "mean / mm", "s / µm", "mean error / µm", "U / µm"], numeric=(2, 3, 4, 5, 6),
+        rows=[[r.group, r.name, str(r.n), f"{r.mean:.5f}", _um(r.s), "–" if r.error is None else _um(r.error, True),
+               _um(r.U)] for r in found],
         folded=len(found) > MANY,
+    )]
+
+
+def _budgets(results: MeasurementResults) -> list[Section]:
+    """Where the uncertainty comes from, where more than the fit is known."""
+    found = [b for b in results.budgets() if b.unit == "mm"]
+    if not any((b.repeats, b.calibration, b.simulation) != (None, None, None) for b in found):
+        return []
+
+    def cells(b: Budget) -> list[str]:
+        shares = ["–" if u is None or not math.isfinite(u) else _um(u) for u in
+                  (b.fit, b.repeats, b.calibration, b.simulation)]
+        return [b.volume, b.name, *shares, "–" if b.mean_error is None else _um(b.mean_error, True),
+                f"{b.corrected:.5f}", _um(b.U) if math.isfinite(b.U) else "–"]
+
+    return [Section(
+        title="Uncertainty", lead="Standard uncertainties, each by itself, and the 95 % interval of all together.",
+        blocks=[Table(
+            title="Shares",
+            meaning="Fit and repeats show the same scatter, the larger counts; the calibration's share is added in "
+            "squares. Virtual scans hold both: the larger result counts, and their mean error is taken off the value.",
+            columns=["volume", "name", "fit / µm", "repeats / µm", "calibration / µm", "simulation / µm",
+                     "its mean error / µm", "corrected / mm", "U / µm"],
+            numeric=tuple(range(2, 9)), rows=[cells(b) for b in found], folded=len(found) > MANY,
+        )],
     )]
 
 
@@ -242,7 +298,7 @@ def _comparison(name: str, comparison: Comparison, range_mm: float) -> Section:
             "type": "mesh3d", "x": np.round(x[:, 0], 4), "y": np.round(x[:, 1], 4), "z": np.round(x[:, 2], 4),
             "i": faces[:, 0], "j": faces[:, 1], "k": faces[:, 2],
             "intensity": [None if not math.isfinite(d) else round(float(d), 2) for d in deviation],
-            "cmin": -limit, "cmax": limit, "colorscale": _vik(), "colorbar": colour_bar("µm"),
+            "cmin": -limit, "cmax": limit, "colorscale": vik_scale(), "colorbar": colour_bar("µm"),
             "lighting": {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0},
             "hovertemplate": "%{intensity} µm<extra></extra>",
         }],
@@ -265,13 +321,3 @@ def _comparison(name: str, comparison: Comparison, range_mm: float) -> Section:
         f"{100 * comparison.share_within(range_mm):.1f} % of {len(comparison.measured)} vertices."
     ])
     return Section(title=f"Nominal-actual comparison: {name}", blocks=[view, histogram, percentiles, moved])
-
-
-def _vik() -> list[list[Any]]:
-    try:
-        from cmcrameri import cm
-    except ImportError as error:
-        raise EngineMissingError("the colour map needs cmcrameri", install_line=INSTALL_LINE) from error
-    steps = np.linspace(0, 1, 33)
-    rgb = np.round(255 * np.asarray(cm.vik(steps))[:, :3]).astype(int)
-    return [[float(s), f"rgb({r},{g},{b})"] for s, (r, g, b) in zip(steps, rgb.tolist(), strict=True)]
