@@ -25,6 +25,7 @@ LIGHT = np.array([-0.35, 0.45, 0.82])
 """Direction to the light: right, up, towards the viewer."""
 AMBIENT = 0.5
 FILL_ROUNDS = 3
+SPECK_MM = 0.01
 
 
 def vik_scale(steps: int = 33) -> list[list[Any]]:
@@ -132,7 +133,8 @@ def deviation_figure(
                        "sizex": width, "sizey": height, "sizing": "stretch", "layer": "below"})
         words.append({"x": (k + 0.5) * width, "y": height, "text": name, "showarrow": False, "yanchor": "bottom"})
     bare: dict[str, Any] = {"visible": False, "showgrid": False, "zeroline": False}
-    scale = {"type": "heatmap", "x": [0, 1], "y": [0, 1], "z": [[None, None], [None, None]], "zmin": -range_um,
+    # A speck in the corner carries the colour bar.
+    scale = {"type": "heatmap", "x": [0, SPECK_MM], "y": [0, SPECK_MM], "z": [[0, 0], [0, 0]], "zmin": -range_um,
              "zmax": range_um, "colorscale": vik_scale(), "colorbar": colour_bar("deviation / µm")}
     return Figure(
         title=title, meaning=meaning, look_for=look_for, data=[scale], height=620,
