@@ -39,6 +39,7 @@ CORNER_SIGMA_PX = 0.1
 
 D_SD_MM = 1000.0
 UNDISTORTIONS = 50
+QUANTILES = (0.025, 0.5, 0.975)
 TOGETHER = 12
 """Corners, evenly spread, from which the robot's errors are estimated; more do not change them and take long."""
 
@@ -164,16 +165,22 @@ def study(folder: Path, corners: Any = range(408), *, joined: int = TOGETHER, ch
     residual = [float(np.sqrt(((p.x_D - blocks(p, free, f).x_D) ** 2).sum(axis=1).mean()))
                 for p, f in zip(problems, fits, strict=True)]
     run = together([problems[int(k)] for k in (np.arange(joined) + 0.5) * len(problems) / joined])
-    field = estimate_pose_field([run], free, [best_fit(run, free)], length=None, angle=None, base="M")
-    solved = [solve_with_field(p, free, f, field) for p, f in zip(problems, fits, strict=True)]
+    joint = best_fit(run, free)
+
+    def modelled(angle: float | None) -> tuple[PoseField, list[Fit], Spread]:
+        field = estimate_pose_field([run], free, [joint], length=None, angle=angle, base="M")
+        solved = [solve_with_field(p, free, f, field) for p, f in zip(problems, fits, strict=True)]
+        return field, [f for f, _ in solved], normalised_spread([f for f, _ in solved], [C for _, C in solved])
+
+    field, solved, spread = modelled(None)
     return {
         "corners": len(problems),
         "residual_px": float(np.median(residual)),
         "field": field,
         "plain": normalised_spread(fits, plain),
-        "modelled": normalised_spread([f for f, _ in solved], [C for _, C in solved]),
-        "chance": np.quantile(by_chance(problems, free, [f for f, _ in solved], field), [0.025, 0.5, 0.975], axis=0)
-        if chance else None,
+        "modelled": spread,
+        "place_only": modelled(np.inf)[2] if chance else None,
+        "chance": np.quantile(by_chance(problems, free, solved, field), QUANTILES, axis=0) if chance else None,
     }
 
 
