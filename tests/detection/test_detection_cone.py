@@ -79,8 +79,8 @@ def test_profiles_are_convolutions(kappa: float) -> None:
             return quad(lambda x: f(x) * norm.pdf(at - x, scale=sigma), low, high, points=cut, epsabs=1e-11)[0]  # type: ignore[operator]
 
         # A pixel is a box: beyond its variance, which sigma holds, its fourth cumulant -(c^4 + s^4) / 120, mean 3/4.
-        x = s / sigma
-        box = -0.75 / 120 / 24 * -(x**3 - 3 * x) * norm.pdf(x) / sigma**4
+        ratio = s / sigma
+        box = -0.75 / 120 / 24 * -(ratio**3 - 3 * ratio) * norm.pdf(ratio) / sigma**4
         tolerance = 1e-9 if np.isinf(kappa) else 2e-5
         assert table[i, 0] == pytest.approx(convolved(through) + box, abs=tolerance)
         assert table[i, 3] == pytest.approx(convolved(lambda x: x * through(x)), abs=10 * tolerance)

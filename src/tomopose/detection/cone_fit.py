@@ -14,20 +14,19 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from tomopose.detection.background import MOST_LINES, whole_ring, without_worst_lines
 from tomopose.detection.cholesky import solve
 from tomopose.detection.cone import ring_pixels
 from tomopose.detection.edges import FIRST_NODE, N_SHAPE, SHAPE, influence
 from tomopose.detection.nested import nearer
 from tomopose.detection.noise import correlation, sandwich, weights
-from tomopose.detection.rim import STAY, Rim
+from tomopose.detection.rim import ENOUGH, STAY, Rim
 from tomopose.errors import BallNotFoundError
 from tomopose.geometry.scanner import Scanner
 from tomopose.units import Array
 
 OUTLIER = 6.0
 """Residual in standard deviations from which a single pixel counts as bad."""
-GROSS = 0.1
-"""Share of the contrast from which a residual can spoil a least-squares start."""
 MISFIT = 4.0
 """Standard deviations by which a sector's chi-square must exceed 1 for its background to count as badly fitted."""
 STEEPEST = 6.0
@@ -111,9 +110,14 @@ def fit_cone(
         _choose_kappa(rim, spread, start)
         shape = (*shape, "kappa")
 
-    rim.outside, rim.every = rim.reach, 1
-    rim.gather()
-    _robust_background(rim, spread)
+    whole_ring(rim, spread)
+    for _ in range(MOST_LINES):
+        if not without_worst_lines(rim):
+            break
+        if not kappa_free:
+            rim.begin()
+            _approach(rim, spread)
+        whole_ring(rim, spread)
     if kappa_free:
         for _ in range(10):
             if rim.step(rim.active(*shape, curvature=False), careful=True) < 1e-3:
@@ -166,26 +170,6 @@ def _approach(rim: Rim, spread: float) -> None:
         rim.weight = np.where(out, 0.0, 1.0 / (0.03 * spread) ** 2)
 
 
-def _robust_background(rim: Rim, spread: float) -> None:
-    """The background over the whole ring; dead lines and hot pixels, if there are any, get little weight (Cauchy)."""
-    equal = np.full(rim.u.size, 1.0 / (0.03 * spread) ** 2)
-    rim.weight = equal
-    rim.evaluate(STAY)
-    active = rim.active(curvature=False)
-    rim.step(active)
-    away = np.abs(rim.rim[0]) > 3.0
-    for _ in range(6):
-        size = np.abs(rim.residual[away])
-        if size.size == 0 or size.max() < GROSS * abs(rim.level - rim.white):
-            break
-        scale = 1.4826 * float(np.median(size)) + 1e-9 * spread
-        if size.max() < 9.0 * scale:
-            break
-        x = np.where(away, rim.residual / (3.0 * scale), 0.0)
-        rim.weight = equal / (1.0 + x**2) ** 2
-        rim.step(active)
-
-
 def _is_transparent(rim: Rim) -> bool:
     """Whether the ball grows darker towards its middle by more than noise and 1 % of its contrast."""
     depth = 3 * rim.shape[3] + 0.5
@@ -195,9 +179,10 @@ def _is_transparent(rim: Rim) -> bool:
     rings = ((radius - depth - 0.08 * radius - 1.0, radius - depth), (0.0, max(0.6 * (radius - depth), 1.5)))
     middle = []
     for low, high in rings:
+        every = 1 + 2 * int(math.pi * (high**2 - low**2) / (2 * ENOUGH))
         *_, value = ring_pixels(
             rim.window, rim.good, rim.origin[0], rim.origin[1], rim.shape[0], rim.shape[1], low, high,
-            rim.scanner.p_u / rim.p, rim.scanner.p_v / rim.p, 1,
+            rim.scanner.p_u / rim.p, rim.scanner.p_v / rim.p, every,
         )  # fmt: skip
         if value.size < 5:
             return False
@@ -319,10 +304,8 @@ def _result(
         effect = influence(rim.jacobian, rim.left, rim.weight, _scattered(rim, active, rows), rim.n_nodes)
         block = sandwich(rim.u, rim.v, effect, rho)
     near = (np.abs(s) <= 3 * sigma) & clean
-    n_near = max(int(near.sum()), 1)
     chi2_near = float((normalised[near] ** 2).mean()) if near.any() else 1.0
-    if chi2_near > 1.0 + 5.0 * math.sqrt(2.0 / n_near):
-        block = block * chi2_near
+    block = block * max(chi2_near, 1.0)
     block[:2, :2] += doubt
     all_near = (np.abs(s) <= 3 * sigma) & (rim.weight > 0)
     rim_rms = math.sqrt(float((rim.residual[all_near] ** 2).mean())) if all_near.any() else 0.0
@@ -359,10 +342,13 @@ def _scattered(rim: Rim, active: npt.NDArray[np.intp], rows: Array) -> Array:
 def _rim_shares(rim: Rim) -> tuple[float, float]:
     """Share of the rim's directions with a pixel in the image, and share of the rim's pixels that were left out."""
     radius, half = rim.shape[2], max(1.5, 2 * rim.shape[3])
+    used = np.abs(rim.rim[0]) < half
+    kept = np.count_nonzero(rim.weight[used])
+    if rim.whole():
+        return 1.0, 1.0 - kept / max(int(used.sum()), 1)
     *_, every = rim.ring(np.ones_like(rim.good), -half, half, 1)
     every = every[:, np.abs(every[0]) < half]
     bins = int(np.clip(2 * radius, 16, 180))
     angle = np.arctan2(every[5], every[4])
     seen = np.unique(np.floor((angle / (2 * math.pi) + 0.5) * bins * (1 - 1e-12)))
-    kept = (np.abs(rim.rim[0]) < half) & (rim.weight > 0)
-    return seen.size / bins, max(0.0, 1.0 - float(kept.sum()) / max(every.shape[1], 1))
+    return seen.size / bins, max(0.0, 1.0 - kept / max(every.shape[1], 1))

@@ -43,16 +43,18 @@ def nearer(rim: Rim, active: npt.NDArray[np.intp], *, careful: bool, noise: floa
         steps.append(X[:2, 2])
         covariances.append((X[:2, :2] + X[:2, :2].T) / 2)
     chosen = len(sizes) - 1
-    while chosen > 0 and any(
-        _chi2(steps[n] - steps[chosen], covariances[n] - covariances[chosen]) > IMPLAUSIBLE * noise for n in range(chosen)
-    ):
+    while chosen > 0:
+        D = np.array(steps[:chosen]) - steps[chosen]
+        C = np.array(covariances[:chosen]) - covariances[chosen]
+        if max(_chi2(*pair) for pair in zip(D, C, strict=True)) < IMPLAUSIBLE * noise:
+            break
         chosen -= 1
     if chosen == len(sizes) - 1:
         return np.zeros((2, 2))
     rim.use_shells(sizes[chosen])
     rim.polish(active, careful=careful)
-    D = steps[chosen] - steps[chosen + 1]
-    return np.asarray(REMAINING * np.outer(D, D))
+    move = steps[chosen] - steps[chosen + 1]
+    return np.asarray(REMAINING * np.outer(move, move))
 
 
 def _chi2(D: Array, C: Array) -> float:

@@ -18,6 +18,8 @@ SMALLEST = 0.06
 """Correlation of neighbours below which noise counts as white: a holder leaves some in the residuals too."""
 
 
+CLIPPED = 0.25
+"""Share of the lower quartile below which a sector's variance is that of a saturated background."""
 NORMAL_MEDIAN = 0.455
 """Median of the square of a standard normal variable."""
 
@@ -104,9 +106,10 @@ def weights(s, residual, model, first, sigma, level, white, floor, parameters, o
 def _quiet(variance, n):  # type: ignore[no-untyped-def]
     """(mean, relative spread) of the sectors' variances that belong together at their low end.
 
-    n: pixels of a sector.  A holder's edges add to a sector's variance and never take any away.
+    n: pixels of a sector.  A holder's edges add to a sector's variance; only a clipped background takes some away.
     """
     ordered = np.sort(variance)
+    ordered = ordered[ordered > CLIPPED * ordered[ordered.shape[0] // 4]]
     m = ordered.shape[0]
     low, quarter = ordered[m // 10], ordered[m // 4]
     spread = max(math.sqrt(2.0 / n), min((quarter - low) / (0.607 * max(quarter, 1e-300)), 0.5))

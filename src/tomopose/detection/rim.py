@@ -52,15 +52,20 @@ class Rim:
         self.n_nodes = int(np.clip(round(2 * math.pi * radius / 9.5), 6, 36))
         self.nodes, self.white = np.zeros((self.n_nodes, 3)), 0.0
         self.reach = float(np.clip(0.35 * radius, 5.0, 22.0))
-        self.outside = min(self.reach, 6.0)
         self.inside = float(min(5.0, radius - 0.5))
         box = np.array([scanner.p_u, scanner.p_v]) ** 2 / (12 * self.p**2)
         self.box_u, self.box_v = box - box.mean()
         self.precision = np.zeros(3 * self.n_nodes)
         self.kappa_start, self.white_prior = 1.0, (0.0, 0.0)
-        self.shells, self.turned = SHELLS, False
+        self.shells, self.turned, self.linear = SHELLS, False, False
+        self.margin = 1.6 + cone_eccentricity(scanner, self.shape[:2], radius * self.gamma_px)
         self._sums: tuple[Array, Array, Array] | None = None
-        pixels = 2 * math.pi * radius * (self.inside + self.outside)
+        self.begin()
+
+    def begin(self) -> None:
+        """Takes some of the pixels near the rim."""
+        self.outside = min(self.reach, 6.0)
+        pixels = 2 * math.pi * self.shape[2] * (self.inside + self.outside)
         self.every = 5 if pixels > 5 * ENOUGH else 3 if pixels > 3 * ENOUGH else 1
         self.gather()
 
@@ -82,12 +87,22 @@ class Rim:
     def ring(self, good: Array, low: float, high: float, every: int) -> tuple[Array, Array, Array, Array]:
         """u, v, value (n,) and rim (6, n) of all pixels with s in [low, high], one in `every`, and of some beyond."""
         scanner, radius = self.scanner, self.shape[2]
-        margin = 1.5 + 0.02 * (high - low) + cone_eccentricity(scanner, self.shape[:2], radius * self.gamma_px)
+        margin = self.margin + 0.02 * (high - low)
         u, v, value = ring_pixels(
             self.window, good, self.origin[0], self.origin[1], self.shape[0], self.shape[1], radius + low - margin,
             radius + high + margin, scanner.p_u / self.p, scanner.p_v / self.p, every,
         )  # fmt: skip
         return u, v, value, self.coordinates(u, v)
+
+    def whole(self) -> bool:
+        """Whether the rim lies in the window, and every pixel of the window is good."""
+        u, v, radius = self.shape[:3]
+        reach_u = (radius + 2.0 + self.margin) * self.p / self.scanner.p_u
+        reach_v = (radius + 2.0 + self.margin) * self.p / self.scanner.p_v
+        rows, columns = self.window.shape
+        left, below = u - self.origin[0], v - self.origin[1]
+        inside = min(left - reach_u, below - reach_v) > 0
+        return bool(inside and left + reach_u < columns - 1 and below + reach_v < rows - 1 and self.good.all())
 
     def coordinates(self, u: Array, v: Array) -> Array:
         s = self.shape
@@ -126,6 +141,7 @@ class Rim:
         opaque = math.isinf(self.shape[4])
         use = np.ones(FIRST_NODE + 6, dtype=bool)
         use[4], use[5:7] = not opaque, self.turned
+        use[:WHITE] &= not self.linear
         if shell > 0 and opaque and SHELL_EDGES[0] > FLAT * self.shape[3]:
             use[[3, 5, 6, WHITE]] = False
         return np.flatnonzero(use)
