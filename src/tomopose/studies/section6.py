@@ -7,6 +7,7 @@ from typing import Any
 
 from tomopose.studies.result import Progress, Scale
 from tomopose.studies.section6_calibrations import GRID, calibrations
+from tomopose.studies.section6_checks import checks_of
 from tomopose.studies.section6_figures import figures_of
 from tomopose.studies.section6_scan import MAGNIFICATION, Numbers, Object, Path, Radiographs, scan_with
 from tomopose.studies.section6_specimen import measure_specimen, reference
@@ -15,7 +16,6 @@ from tomopose.studies.section6_tables import (
     MPE_A_UM,
     MPE_K,
     calibration_rows,
-    checks_of,
     specimen_rows,
     standard_rows,
 )

@@ -70,7 +70,7 @@ def picture(found: Found, mesh: Mesh, *, third: bool = False) -> Figure:
         maps, mesh.points, mesh.faces, mesh.normals, range_um=RANGE_UM, title="Fig. 12: deviation map",
         meaning=f"Measured surface minus the specimen as made, clipped at ±{RANGE_UM:g} µm; edges take the colours of "
         "their neighbours.",
-        look_for="Waves along the circumference by the paper's method; none by ours.",
+        look_for="Waves along the circumference by the paper's method; by ours they are gone.",
     )
 
 
@@ -127,7 +127,7 @@ def around(found: Found, mesh: Mesh) -> Figure:
     return Figure(
         title="Fig. 12: deviation around the rotation axis",
         meaning="Mean over the cylinder areas, by the direction of the surface's normal.",
-        look_for="Seven waves by the paper's method; by ours what the circular scan has too.",
+        look_for="Seven waves by the paper's method; by ours what voxels and views leave.",
         data=data, layout=layout(xaxis=axis("angle / deg"), yaxis=axis("deviation / µm")),
     )
 
@@ -175,7 +175,7 @@ def figures_of(found: Found, mesh: Mesh, numbers: Numbers) -> tuple[Figure, ...]
         picture(found, mesh), unrolled(found, mesh), around(found, mesh), slices(found),
         bars(found, compared("specimen", runs["specimen"]), "length_um", lengths, title="Fig. 13: lengths",
              meaning="Errors of L1 to L6 between planes and L7 between calottes.",
-             look_for="Bars of the 3D scan by our best are no longer than the circular scan's."),
+             look_for="Whether bars of the 3D scan by our best are longer than the circular scan's."),
         distance_errors(found, runs["standard"]),
         bars(found, standard, "diameter_um", balls, title="Fig. 15: sphere diameters",
              meaning="Errors of the 27 diameters.", look_for="Scatter from ball to ball."),
