@@ -8,12 +8,28 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numba import njit
 from scipy.special import ndtr
 
 from tomopose.geometry.frames import Frame
 from tomopose.simulation.materials import attenuation
 from tomopose.simulation.run import SimulatedRun
 from tomopose.simulation.view import View
+
+
+@njit(cache=True)
+def _chords(base: Any, v: Any, V: Any, c: Any, r: float) -> Any:
+    """Chords (rows, columns), mm, of a ball at c on rays from the origin along base + v V."""
+    out = np.zeros((len(v), len(base)))
+    for j in range(len(v)):
+        for i in range(len(base)):
+            x, y, z = base[i, 0] + v[j] * V[0], base[i, 1] + v[j] * V[1], base[i, 2] + v[j] * V[2]
+            # |c x d| / |d| is the distance at which the ray passes the ball's centre.
+            a, b, e = c[1] * z - c[2] * y, c[2] * x - c[0] * z, c[0] * y - c[1] * x
+            inside = r * r - (a * a + b * b + e * e) / (x * x + y * y + z * z)
+            if inside > 0:
+                out[j, i] = 2 * np.sqrt(inside)
+    return out
 
 
 def ball_image(run: SimulatedRun, i: int, window: tuple[int, int, int, int], *, n: int = 96, sigma: float) -> Any:
@@ -40,16 +56,12 @@ def ball_image(run: SimulatedRun, i: int, window: tuple[int, int, int, int], *, 
 
     k_u, k_v = weights(u, u_0 + np.arange(n_u)), weights(v, v_0 + np.arange(n_v))
     out = np.zeros((n_v, n_u))
-    base = view.O[None] - view.source + u[:, None] * view.U
+    base = np.ascontiguousarray(view.O[None] - view.source + u[:, None] * view.U)
     for start in range(0, len(v), n):
         rows = slice(start, start + n)
         if not k_v[rows].any():
             continue
-        d = base[None] + v[rows, None, None] * view.V
-        # |c x d| / |d| is the distance at which the ray passes the ball's centre.
-        passing = np.cross(np.broadcast_to(c, d.shape), d)
-        inside = r * r - np.einsum("vui,vui->vu", passing, passing) / np.einsum("vui,vui->vu", d, d)
-        chord = 2 * np.sqrt(np.maximum(inside, 0.0))
+        chord = _chords(base, v[rows], view.V, c, r)
         out += k_v[rows].T @ (np.interp(chord, chords, table) @ k_u)
     return out
 
