@@ -285,3 +285,14 @@ def test_tiny_rotations_are_called_doubtful():
     cal = calibrate(SCANNER, poses, observe(poses), hypotheses=False)
     assert cal.verdict == "doubtful"
     assert any("5 degrees" in reason for reason in cal.reasons)
+
+
+@pytest.mark.parametrize("n", [6, 8, 12])
+def test_few_poses_do_not_seem_to_drift(n):
+    found = [
+        e["p"]
+        for seed in range(10)
+        for e in calibrate(SCANNER, mixed_poses(seed, n=n), observe(mixed_poses(seed, n=n), seed=seed),
+                           hypotheses=False).extra["integrity"]["effects"]
+    ]
+    assert min(found) > 1e-4

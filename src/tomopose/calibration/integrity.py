@@ -126,7 +126,9 @@ def drift(problem: Problem, Jw: Array, rw: Array, columns: Array, *, name: str, 
 def _p(gain: float, c: int, left: float, dof: int) -> float:
     """Probability by chance that c columns explain as much: an F test, so that what has moved hides neither in the
     offset that goes with it nor in a pose noise that was estimated from it."""
-    return float(fdtrc(c, max(dof, 1), max(gain, 0.0) / c / max(left / max(dof, 1), 1e-300)))
+    if dof < 1:
+        return 1.0
+    return float(fdtrc(c, dof, max(gain, 0.0) / c / max(left / dof, 1e-300)))
 
 
 def _share(explained: float, rw: Array) -> float:
