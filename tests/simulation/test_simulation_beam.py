@@ -71,6 +71,22 @@ def test_the_condensed_spectrum_transmits_what_the_full_one_does(rng):
     assert np.abs(beam.transmission(L) - full).max() < 3 * CONDENSED_ERROR
 
 
+@pytest.mark.parametrize("voltage", [120.0, 180.0])
+@pytest.mark.parametrize(
+    ("names", "longest"), [(("ruby",), 135.0), (("ruby", "alumina", "Invar"), 90.0), (("air",), 1000.0), (("W",), 0.01)]
+)
+def test_every_spectrum_can_be_condensed(voltage, names, longest, rng):
+    for filters in ((), (("Al", 2.0),)):
+        spectrum = tube_spectrum(voltage).absorbed_energy("CsI", 0.6)
+        for material, thickness in filters:
+            spectrum = spectrum.filtered(material, thickness)
+        beam = condense(spectrum, names, [longest] * len(names))
+        L = np.outer(rng.random(40), np.full(len(names), longest / len(names)))
+        mu = np.stack([attenuation(n, spectrum.energy) for n in names], axis=1)
+        full = np.exp(-L @ mu.T) @ (spectrum.weight / spectrum.weight.sum())
+        assert np.abs(beam.transmission(L) - full).max() < 3 * CONDENSED_ERROR
+
+
 def test_kernels_attenuate_as_the_sum_does(rng):
     spectrum = tube_spectrum(120.0).filtered("Cu", 0.5).absorbed_energy("CsI", 0.6)
     beam = condense(spectrum, ("PEEK", "Al", "WC-Co"), (12.0, 40.0, 8.0))

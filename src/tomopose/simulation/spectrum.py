@@ -19,6 +19,7 @@ from tomopose.simulation.attenuate import tabulated
 from tomopose.simulation.materials import MATERIALS, Material, attenuation, table
 from tomopose.units import Array, float_array
 
+MOST_STEPS = 1000
 CONDENSED_ERROR = 1e-5
 """Largest error of a transmission computed with the condensed spectrum, as a share of the unattenuated beam."""
 
@@ -155,7 +156,13 @@ def condense(
     order = qr(A, mode="r", pivoting=True)[1]
     for n in range(4, min(41, len(w)), 2):
         keep = np.sort(order[:n])
-        solution, _ = nnls(np.vstack([A[:, keep], np.full((1, n), 1e3)]), np.append(target, 1e3))
+        try:
+            solution, _ = nnls(
+                np.vstack([A[:, keep], np.full((1, n), 1e3)]), np.append(target, 1e3), maxiter=MOST_STEPS
+            )
+        except RuntimeError:
+            # It goes round in circles among nearly equal columns: another choice of energies, or all of them.
+            continue
         solution /= solution.sum()
         error = float(np.abs(A[:, keep] @ solution - target).max())
         if error < CONDENSED_ERROR:
