@@ -209,7 +209,7 @@ def test_virtual_scans_from_the_command_line(folder):
     (folder / "nominal.toml").write_text(plan, encoding="utf-8")
     out = folder / "simulated"
     assert run(folder / "nominal.toml", "--volume", folder / "scan1.h5", "--simulate", folder / "scene.toml",
-               "--draws", "3", "--seed", "4", "--simulate-voxel", "1.5", "--out", out, "--quiet") == 0
+               "--draws", "3", "--seed", "4", "--simulate-voxel", "1.1", "--out", out, "--quiet") == 0
     rows = {r["name"]: r for r in rows_of(out / "uncertainty.csv")}
     length = rows["L1"]
     assert float(length["simulation"]) > 0

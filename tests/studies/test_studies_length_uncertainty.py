@@ -99,7 +99,7 @@ def test_virtual_scans_with_drawn_calibrations_scatter_as_the_covariance_says(ru
     wide = replace(calibration, tangent=(*calibration.tangent, "d_SR"),
                    covariance=block_diag(calibration.covariance, 0.2**2))
     grid = tp.VoxelGrid.cube(n=SIZE, spacing=VOXEL)
-    draws = 14
+    draws = 10
     found = simulated_errors(run, plan(), grid, draws=draws, calibration=wide, seed=3)
     features = {f"ball {k}": fit_sphere(sphere_pattern(b, RADIUS, 200)[0]) for k, b in enumerate(BALLS)}
     stated = calibration_shares(results(features), plan(), "scan", wide, run.poses)["SD"]

@@ -8,7 +8,8 @@
 Scans that repeat scatter by the noise that the fit states, and by more: the larger of both stands for the two.  To it
 the calibration's share is added in squares, since one calibration serves all repeats.  A simulation draws noise and
 calibrations by itself, so it is no further share: the larger of both results counts.  Its mean error is a systematic
-one (blur, the exponential mean over a pixel, artefacts) and is taken off the value.
+one (blur, the exponential mean over a pixel, artefacts) and is taken off the value; not off a form deviation, which
+noise makes larger, never smaller.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ COVERAGE = 0.95
 class Budget:
     """Standard uncertainties of one result, mm or rad; None where a share was not looked at.
 
-    mean_error: of the simulated scans, None without truth;  corrected: the value with it taken off;
+    mean_error: of the simulated scans, None without truth and for form;  corrected: the value with it taken off;
     u, dof, U:  combined standard uncertainty, its degrees of freedom, half width of the 95 % interval.
     """
 
@@ -84,7 +85,8 @@ def budget(
         next_one = simulated.u * math.sqrt(1.0 + 1.0 / simulated.runs)
         if half_width(next_one, simulated.runs - 1.0) > half_width(u, dof):
             u, dof = next_one, simulated.runs - 1.0
-        mean_error = simulated.mean if math.isfinite(simulated.mean) else None
+        systematic = math.isfinite(simulated.mean) and not result.kind.startswith("form")
+        mean_error = simulated.mean if systematic else None
     known = math.isfinite(result.u) or s is not None or simulated is not None
     return Budget(
         volume=result.volume, name=result.name, unit=result.unit, fit=result.u, repeats=s, calibration=calibration,

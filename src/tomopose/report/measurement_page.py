@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tomopose.geometry.rotations import log_rotation
 from tomopose.measurement.budget import Budget
 from tomopose.measurement.comparison import Comparison
 from tomopose.measurement.results import MeasurementResult, MeasurementResults
@@ -29,7 +30,7 @@ from tomopose.report.page import (
 from tomopose.report.provenance_section import provenance_section
 from tomopose.report.style import ACCENT, ALERT, LINE, ORANGE, axis, colour_bar, layout, space_axis
 from tomopose.report.words import NOT_DETERMINABLE, number
-from tomopose.units import MICROMETRES_PER_MM
+from tomopose.units import MICROMETRES_PER_MM, Array
 
 COLOURS = (ACCENT, ORANGE, "#2b7d4f", "#8a6bb1", "#b2433f", "#4a4a4a")
 MANY = 40
@@ -316,8 +317,14 @@ def _comparison(name: str, comparison: Comparison, range_mm: float) -> Section:
     percentiles = Table(title="Percentiles", meaning="", columns=["share", "deviation / µm"], numeric=(1,),
                         rows=[[k, _um(v, True)] for k, v in comparison.percentiles().items()])
     moved = Words(title="Alignment", paragraphs=[
-        f"Rule: {comparison.alignment.rule}. Moved by {_um(comparison.moved_mm)} µm and turned by "
+        f"Rule: {comparison.alignment.rule}. Part to W: rotation vector "
+        f"{_vector(1000 * log_rotation(comparison.alignment.R))} mrad, translation "
+        f"{_vector(comparison.alignment.t)} mm. Moved by {_um(comparison.moved_mm)} µm and turned by "
         f"{comparison.turned_rad * 1e6:.1f} µrad by the fit. Within ±{limit:g} µm: "
         f"{100 * comparison.share_within(range_mm):.1f} % of {len(comparison.measured)} vertices."
     ])
     return Section(title=f"Nominal-actual comparison: {name}", blocks=[view, histogram, percentiles, moved])
+
+
+def _vector(x: Array) -> str:
+    return "(" + ", ".join(f"{v:.4f}" for v in x) + ")"

@@ -1,8 +1,8 @@
 """The uncertainty of measurands by simulation with the virtual CT (JCGM 101:2008).
 
 Each draw is a whole scan of the nominal object: photon noise of its own, matrices from a calibration drawn from its
-covariance, reconstruction, measurement by the plan.  The noiseless images are made once, since neither noise nor the
-matrices that are believed change them.
+covariance, reconstruction on a grid shifted by a part of a voxel, since nobody knows where in its voxels a part lies,
+and measurement by the plan.  The noiseless images are made once: nothing of this changes them.
 """
 
 from __future__ import annotations
@@ -79,17 +79,18 @@ def virtual_volumes(
     run: SimulatedRun, grid: VoxelGrid, *, draws: int, calibration: Calibration | None = None, seed: int = 0,
     options: Mapping[str, Any] | None = None,
 ) -> Iterator[Volume]:
-    """Reconstructions of the run, each with noise and believed matrices of its own; draw k is always the same."""
+    """Reconstructions of the run, each with noise, believed matrices and grid of its own; draw k is always the same."""
     believed = _Believed(run, calibration)
     clean = [signal(run, i).astype(np.float32) for i in range(len(run))]
     for k in range(draws):
         sequence = np.random.SeedSequence([seed, k])
-        noise = int(sequence.generate_state(1)[0])
-        matrices = believed.matrices(np.random.default_rng(sequence))
+        noise, rng = int(sequence.generate_state(1)[0]), np.random.default_rng(sequence)
+        matrices = believed.matrices(rng)
+        shifted = replace(grid, centre=grid.centre + grid.spacing * rng.uniform(-0.5, 0.5, 3))
         images = [expose(T.astype(np.float64), run.detector, run.scanner, seed=noise, frame=i)
                   for i, T in enumerate(clean)]
         white, dark = _levels(run, noise)
-        yield reconstruct(images, matrices, grid, images_are="counts", white=white, dark=dark, consistency="off",
+        yield reconstruct(images, matrices, shifted, images_are="counts", white=white, dark=dark, consistency="off",
                           **dict(options or {}))
 
 
