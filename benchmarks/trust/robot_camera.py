@@ -165,21 +165,15 @@ def study(folder: Path, corners: Any = range(408), *, joined: int = TOGETHER, ch
     residual = [float(np.sqrt(((p.x_D - blocks(p, free, f).x_D) ** 2).sum(axis=1).mean()))
                 for p, f in zip(problems, fits, strict=True)]
     run = together([problems[int(k)] for k in (np.arange(joined) + 0.5) * len(problems) / joined])
-    joint = best_fit(run, free)
-
-    def modelled(angle: float | None) -> tuple[PoseField, list[Fit], Spread]:
-        field = estimate_pose_field([run], free, [joint], length=None, angle=angle, base="M")
-        solved = [solve_with_field(p, free, f, field) for p, f in zip(problems, fits, strict=True)]
-        return field, [f for f, _ in solved], normalised_spread([f for f, _ in solved], [C for _, C in solved])
-
-    field, solved, spread = modelled(None)
+    field = estimate_pose_field([run], free, [best_fit(run, free)], length=None, angle=None, base="M")
+    found = [solve_with_field(p, free, f, field) for p, f in zip(problems, fits, strict=True)]
+    solved = [f for f, _ in found]
     return {
         "corners": len(problems),
         "residual_px": float(np.median(residual)),
         "field": field,
         "plain": normalised_spread(fits, plain),
-        "modelled": spread,
-        "place_only": modelled(np.inf)[2] if chance else None,
+        "modelled": normalised_spread(solved, [C for _, C in found]),
         "chance": np.quantile(by_chance(problems, free, solved, field), QUANTILES, axis=0) if chance else None,
     }
 

@@ -317,8 +317,7 @@ def robot(shared: Path) -> None:
     print(f"\nReal robot with a camera, {r['corners']} corners, each alone (residual {r['residual_px']:.2f} px): "
           "robust spread of the mounts over the stated uncertainty")
     print(f"{'uncertainty from':44s} {'rotation':>9s} {'all six':>8s}")
-    for words, s in (("J^T J, scaled to the residuals", r["plain"]), ("errors shared by place and turn", r["modelled"]),
-                     ("errors shared by place alone", r["place_only"])):
+    for words, s in (("J^T J, scaled to the residuals", r["plain"]), ("the robot's errors modelled", r["modelled"])):
         print(f"{words:44s} {s.rotation:9.2f} {s.mount:8.2f}")
     print(f"by chance, were the model true: rotation {low[0]:.2f} to {high[0]:.2f} (median {middle[0]:.2f}), "
           f"all six {low[1]:.2f} to {high[1]:.2f} (median {middle[1]:.2f})")
