@@ -91,3 +91,38 @@ def test_scale_bars_are_written_one_way(erring, capsys):
     folder = erring[0]
     assert calibrate(folder, "--distance", "0-1=25", "--out", folder / "x") == 2
     assert "--distance" in capsys.readouterr().err
+
+
+def test_matrices_tell_the_shared_part_from_the_scatter(erring, capsys):
+    folder = erring[0]
+    assert calibrate(folder, "--manipulator", folder / "hexapod.json", "--out", folder / "cal") == 0
+    words = ["matrices", "--calibration", folder / "cal" / "calibration.json", "--poses", folder / "scan.csv"]
+    capsys.readouterr()
+    assert run([*map(str, [*words, "--out", folder / "m.npz"])]) == 0
+    told = capsys.readouterr().out
+    assert "shared by all views" in told
+    assert "of the manipulator's scatter" in told
+    read = tp.read_matrices(folder / "m.npz")
+    assert (read.points_sigma > read.points_sigma_shared).all()
+    ids = tp.read_poses(folder / "scan.csv").pose_id
+    assert run([*map(str, [*words, "--quiet", "--home", ids[6], "--out", folder / "home.npz"])]) == 0
+    again = tp.read_matrices(folder / "home.npz")
+    np.testing.assert_allclose(again.decompose().d_SD, read.decompose().d_SD, rtol=1e-9)
+    assert run([*map(str, [*words, "--quiet", "--home", "nowhere", "--out", folder / "x.npz"])]) == 1
+
+
+def test_plan_for_a_robot_says_what_the_table_angles_are_for(erring, capsys):
+    from tomopose.manipulator.virtual import typical_robot
+
+    folder = erring[0]
+    write_manipulator(folder / "robot.json", typical_robot())
+    words = ["plan", "poses", "--optimal", "--for", "kinematic", "--scanner", folder / "scanner.json", "--images", "30",
+             "--manipulator", folder / "robot.json", "--tilt-deg", "20"]
+    for angles, out in (("0", "still.csv"), ("0,90,180", "turned.csv")):
+        assert run([*map(str, [*words, "--table-angles-deg", angles, "--out", folder / out])]) == 0
+        told = capsys.readouterr().out
+        assert ("scale of the object" in told) == (angles == "0")
+    plan = tp.read_poses(folder / "turned.csv")
+    assert len(plan) == 30
+    assert plan.q is not None
+    assert np.ptp(np.degrees(plan.q[:, 5])) > 180.0, "a robot turns about its tool"
