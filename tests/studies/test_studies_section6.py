@@ -150,7 +150,7 @@ def test_our_run_has_as_many_poses_in_view_and_scatters_anew():
 
 def test_cases_have_names_of_their_own_and_order_is_looked_at_once():
     cases = [*cases_of("specimen", (1, 2)), *cases_of("standard", (1, 2))]
-    assert len({c.name for c in cases}) == len(cases) == 6 + 8
+    assert len({c.name for c in cases}) == len(cases) == 6 + 9
     assert [c.order for c in cases if c.order] == ["sequential", "golden"]
 
 

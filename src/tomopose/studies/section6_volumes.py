@@ -26,8 +26,8 @@ CHECKPOINT_SECONDS = 300.0
 class Case:
     """One volume.
 
-    run:   the calibration run whose matrices are used: 1 before the scan, 2 after it; 0 for the circular scan, whose
-           matrices are the scanner's own.
+    run:   the calibration run whose matrices are used: 1 before the scan, 2 after it; 0 for the true ones, which the
+           circular scan has as the scanner's own.
     order: of the views in one iteration of SART, where it is not the method's own.
     """
 
@@ -43,18 +43,19 @@ class Case:
 
 
 def cases_of(thing: Object, runs: tuple[int, ...]) -> tuple[Case, ...]:
-    """Circular and 3D scan by both methods; for the standard, the order of views as well."""
+    """Circular and 3D scan by both methods; of the standard also with true matrices, and in both orders of views."""
     methods: tuple[Method, ...] = ("paper", "best")
     cases = [Case(thing=thing, path="circular", method=m) for m in methods]
     cases += [Case(thing=thing, path="3D", method=m, run=run) for run in runs for m in methods]
     if thing == "standard":
+        cases.append(Case(thing=thing, path="3D", method="best"))
         cases += [Case(thing=thing, path="3D", method="best", run=1, order=o) for o in ("sequential", "golden")]
     return tuple(cases)
 
 
 def matrices_for(case: Case, scan: Scan, found: Mapping[int, Mapping[Method, Calibration]]) -> ProjectionMatrices:
-    """The matrices with which a case is reconstructed; nothing of the true poses is in those of a 3D scan."""
-    if case.path == "circular":
+    """The matrices with which a case is reconstructed; nothing of the true poses is in those of a calibration."""
+    if case.run == 0:
         return scan.truth
     return projection_matrices(found[case.run][case.method], scan.poses, binning=scan.binning)
 
