@@ -17,7 +17,7 @@ from tomopose.simulation.run import SimulatedRun
 from tomopose.simulation.view import View
 
 
-@njit(cache=True)
+@njit
 def _chords(base: Any, v: Any, V: Any, c: Any, r: float) -> Any:
     """Chords (rows, columns), mm, of a ball at c on rays from the origin along base + v V."""
     out = np.zeros((len(v), len(base)))
