@@ -15,10 +15,12 @@ from tomopose.cli.common import OK, JsonOption, QuietOption, Say
 EPILOG = "Example: tomopose doctor --json"
 
 EXTRAS = {
-    "recon": ("itk-rtk", "zarr"),
+    "recon": ("itk-rtk",),
     "gpu": ("astra-toolbox",),
     "metrology": ("vtk", "scikit-image", "cmcrameri", "matplotlib"),
     "sim": ("spekpy", "xraydb", "embreex", "trimesh", "manifold3d"),
+    "gvxr": ("gvxr",),
+    "step": ("cascadio",),
     "dask": ("dask", "distributed"),
 }
 CORE = ("numpy", "scipy", "numba", "pydantic", "typer", "rich", "tifffile", "imagecodecs", "h5py", "pydicom", "jinja2",
