@@ -34,6 +34,13 @@ class View:
             source=T_SW.apply(np.asarray(source_shift, dtype=np.float64)), O=T_SW.apply(O), U=T_SW.R @ U, V=T_SW.R @ V
         )
 
+    @classmethod
+    def of_matrix(cls, P: Array) -> View:
+        """The view of a projection matrix (3, 4) that gives points before the source a positive third coordinate."""
+        inverse = np.asarray(np.linalg.inv(P[:, :3]), dtype=np.float64)
+        source = -inverse @ P[:, 3]
+        return cls(source=source, O=source + inverse[:, 2], U=inverse[:, 0], V=inverse[:, 1])
+
     def project(self, x: Array) -> Array:
         """Pixels (m, 2) of points (m, 3) of W; OutOfViewError where one lies behind the source."""
         h = np.linalg.solve(np.column_stack([self.U, self.V, self.O - self.source]), (x - self.source).T)

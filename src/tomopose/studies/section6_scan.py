@@ -10,12 +10,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
 from tomopose.geometry.rotations import R_y
 from tomopose.geometry.scanner import Scanner
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.simulation.materials import attenuation
-from tomopose.simulation.mesh import Mesh
+from tomopose.simulation.mesh import Mesh, MeshSolid
 from tomopose.simulation.specimen import specimen_mesh
 from tomopose.simulation.spectrum import tube_spectrum
 from tomopose.simulation.standard import BASE_TOP, SHAFT_DIAMETER, sphere_centres, sphere_diameters
@@ -131,8 +132,10 @@ def path_maker(scan: Scan) -> Callable[[int], Array]:
     n_u, n_v = scan.samples * scan.truth.n_u, scan.samples * scan.truth.n_v
     if scan.thing == "specimen":
         mesh = specimen(scan.edge)
-        vertices, faces = np.ascontiguousarray(mesh.vertices @ MOUNTED.T), np.asarray(mesh.faces)
-        return lambda j: mesh_paths(P[j], vertices, faces, n_u, n_v)
+        solid = MeshSolid(
+            mesh=Mesh(vertices=mesh.vertices @ MOUNTED.T, faces=mesh.faces), material="EN AW-6082", frame=Frame.W
+        )
+        return lambda j: mesh_paths(P[j], solid, n_u, n_v)
     centres = sphere_centres()
     bottom = np.full(len(centres), BASE_TOP)
     return lambda j: ball_paths(P[j], centres, sphere_diameters() / 2, SHAFT_DIAMETER / 2, bottom, n_u, n_v)
