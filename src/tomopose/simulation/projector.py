@@ -39,7 +39,6 @@ FLAT = 2e-3
 """Differences of transmission over a cell below this need no lattice; above 6 times this the finer one; above 24 times
 an edge is cut exactly."""
 HALVINGS = 9
-LINES = np.stack([(np.polynomial.legendre.leggauss(3)[0] + 1) / 2, np.polynomial.legendre.leggauss(3)[1] / 2], axis=1)
 GAUSS = np.stack([(np.polynomial.legendre.leggauss(4)[0] + 1) / 2, np.polynomial.legendre.leggauss(4)[1] / 2], axis=1)
 SMALL_PX = 8.0
 """Where a primitive is thinner than this (half its side, px), every ray is cast."""
@@ -78,8 +77,8 @@ def _split_cell(
             cut = _crossing(c, work, left + u_x, low + v_x, left + u_x + u_y, low + v_x + v_y, m_10)
     for part in range(1 if cut == 1.0 else 2):
         y_0, y_1 = (0.0, cut) if part == 0 else (cut, 1.0)
-        for q in range(len(LINES)):
-            y = y_0 + (y_1 - y_0) * LINES[q, 0]
+        for q in range(len(GAUSS)):
+            y = y_0 + (y_1 - y_0) * GAUSS[q, 0]
             u, v = left + y * u_y, low + y * v_y
             start, mark = at(c, work, u, v)
             end, other = at(c, work, u + u_x, v + v_x)
@@ -93,12 +92,10 @@ def _split_cell(
                 length = -edge if side == 0 else 1.0 - edge
                 if length == 0.0:
                     continue
-                here = mark if side == 0 else other
                 for g in range(len(GAUSS)):
                     x = edge + length * GAUSS[g, 0] ** 2
-                    # Beside the edge, where nothing is met, it is as bright everywhere.
-                    value = 1.0 if here == 0 else at(c, work, u + x * u_x, v + x * v_x)[0]
-                    value *= 2 * GAUSS[g, 0] * GAUSS[g, 1] * abs(length) * LINES[q, 1] * (y_1 - y_0)
+                    value, _ = at(c, work, u + x * u_x, v + x * v_x)
+                    value *= 2 * GAUSS[g, 0] * GAUSS[g, 1] * abs(length) * GAUSS[q, 1] * (y_1 - y_0)
                     a, b = (x - 0.5, y - 0.5) if along_u else (y - 0.5, x - 0.5)
                     gather_value(M, value, a, b)
 
