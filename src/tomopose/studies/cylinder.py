@@ -46,8 +46,8 @@ NOTES = (
     "paper's detection error, for both methods alike. The circular scan does not move it, and has exact matrices.",
     "Reconstruction as in the paper: one iteration of SART with relaxation 0.8, here with views in golden order; the "
     "last row of each kind shows the sequential order, with exact matrices.",
-    "The surface is found where the value is half of the cylinder's, along radii in three slices; each slice's centre "
-    "and mean radius are removed, since object pose and grey level are not in question.",
+    "The surface is found half way between the values inside and outside, radius by radius in three slices; each "
+    "slice's centre and mean radius are removed, since object pose and grey level are not in question.",
 )
 
 
