@@ -189,11 +189,10 @@ def simulated(
 ) -> Any:
     """Errors over virtual scans on the volume's own grid, or a coarser one over the same box."""
     import tomopose as tp
+    from tomopose.cli.simulated import run_of
     from tomopose.studies.simulated_uncertainty import simulated_errors
 
-    content = tp.read_scene(scene)
-    table = content.poses.file
-    run = tp.simulate(content, poses=tp.read_poses(scene.parent / table) if table else None)
+    run = run_of(tp.read_scene(scene), scene)
     file = next(iter(calibrations.values()), None)
     grid = volume.grid
     shape = tuple(max(round(n / coarser), 2) for n in grid.shape)

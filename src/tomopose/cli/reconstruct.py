@@ -63,12 +63,12 @@ def polynomial(scene: Path | None, material: str | None, thickness: float | None
         )
     import tomopose as tp
     from tomopose.reconstruction import beam_hardening_polynomial
+    from tomopose.simulation.build import beam
     from tomopose.simulation.materials import attenuation
 
-    run = tp.simulate(tp.read_scene(scene))
-    energy = run.spectrum.energy
-    mu = attenuation(material, energy, materials=run.materials)
-    return beam_hardening_polynomial(energy, run.spectrum.weight, mu, thickness_mm=thickness)
+    spectrum, materials = beam(tp.read_scene(scene))
+    mu = attenuation(material, spectrum.energy, materials=materials)
+    return beam_hardening_polynomial(spectrum.energy, spectrum.weight, mu, thickness_mm=thickness)
 
 
 def reconstruct(

@@ -47,7 +47,7 @@ def simulate(
     """Make radiographs that can stand in for the scanner's.  The same scene and seed give the same bytes."""
     import tomopose as tp
     from tomopose.cli.job import executor_of
-    from tomopose.cli.simulated import write_run
+    from tomopose.cli.simulated import run_of, write_run
 
     say = Say(json=as_json, quiet=quiet)
     wanted = {}
@@ -60,8 +60,7 @@ def simulate(
     images = 0
     lines = []
     for folder, (scene, content) in wanted.items():
-        table = content.poses.file
-        run = tp.simulate(content, poses=tp.read_poses(scene.parent / table) if table else None)
+        run = run_of(content, scene)
         with say.progress("simulating") as progress, executor_of(dask) as client:
             write_run(
                 folder,

@@ -13,6 +13,14 @@ from tomopose.cli.common import Progress
 RADIOGRAPHS, STACK = "radiographs", "radiographs.h5"
 
 
+def run_of(scene: Any, path: Path) -> Any:
+    """The run of the scene that was read from that path, its poses from the table that it names, if it names one."""
+    import tomopose as tp
+
+    table = scene.poses.file
+    return tp.simulate(scene, poses=tp.read_poses(path.parent / table) if table else None)
+
+
 def image_names(pose_ids: Iterable[str]) -> list[str]:
     """pose_0000.tif ...: numbered so that every sorting gives the acquisition's order."""
     return [f"pose_{k:04d}.tif" for k, _ in enumerate(pose_ids)]

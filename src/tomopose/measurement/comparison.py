@@ -12,10 +12,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tomopose.errors import EngineMissingError, InputError, UnitError
+from tomopose.errors import InputError, UnitError
 from tomopose.geometry.rotations import rotation_angle_between
 from tomopose.measurement.alignment import Alignment, best_fit
-from tomopose.measurement.contour import INSTALL_LINE
+from tomopose.measurement.colours import vik
 from tomopose.measurement.edge_search import EdgeSettings, flag_counts
 from tomopose.measurement.histogram import GreyLevels, grey_levels
 from tomopose.measurement.meshes import Mesh
@@ -74,12 +74,7 @@ class Comparison:
         """(n, 3) uint8: the `vik` map clipped at +-range, grey where nothing was measured."""
         if not range_mm > 0:
             raise InputError(f"the range of the colour map is {range_mm} mm; a positive length is needed")
-        try:
-            from cmcrameri import cm
-        except ImportError as error:
-            raise EngineMissingError("the colour map needs cmcrameri", install_line=INSTALL_LINE) from error
-        t = np.clip(0.5 + 0.5 * np.nan_to_num(self.deviation) / range_mm, 0, 1)
-        rgb = np.round(255 * np.asarray(cm.vik(t))[:, :3]).astype(np.uint8)
+        rgb = vik(np.clip(0.5 + 0.5 * np.nan_to_num(self.deviation) / range_mm, 0, 1))
         rgb[~np.isfinite(self.deviation)] = 150
         return rgb
 

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from tomopose.errors import EngineMissingError, ShapeError
+from tomopose.errors import ShapeError
+from tomopose.measurement.colours import vik
 from tomopose.report.page import Figure
 from tomopose.report.png import colour_png, data_uri
 from tomopose.report.style import axis, colour_bar, layout
 from tomopose.units import Array
 
-COLOURS_INSTALL = "pip install cmcrameri"
 FINER = 2
 """Each pixel is averaged over FINER x FINER."""
 NOT_MEASURED = (150, 150, 150)
@@ -32,15 +32,6 @@ def vik_scale(steps: int = 33) -> list[list[Any]]:
     """The `vik` map (Crameri 2018) as plotly's pairs of place and colour; EngineMissingError without cmcrameri."""
     s = np.linspace(0, 1, steps)
     return [[float(a), f"rgb({r},{g},{b})"] for a, (r, g, b) in zip(s, vik(s).tolist(), strict=True)]
-
-
-def vik(t: Array) -> np.ndarray:
-    """Colours (..., 3), uint8, of places t (...) from 0 to 1."""
-    try:
-        from cmcrameri import cm
-    except ImportError as error:
-        raise EngineMissingError("the colour map needs cmcrameri", install_line=COLOURS_INSTALL) from error
-    return np.asarray(np.round(255 * np.asarray(cm.vik(t))[..., :3]), dtype=np.uint8)
 
 
 def viewpoint(azimuth_deg: float, elevation_deg: float) -> Array:

@@ -46,7 +46,7 @@ def simulate(scene: S.Scene, *, poses: PoseSequence | None = None) -> SimulatedR
     """
     scanner = _scanner(scene.scanner)
     T_HT = _placement(scene.mount.angles_deg, scene.mount.t_mm, Frame.H, Frame.T)
-    materials = {**MATERIALS, **{name: _material(part) for name, part in scene.materials.items()}}
+    spectrum, materials = beam(scene)
     solids, meshes, ball = _objects(scene, materials)
     set_poses = _poses(scene) if poses is None else poses
     recorded, real = _manipulate(scene, set_poses)
@@ -58,7 +58,7 @@ def simulate(scene: S.Scene, *, poses: PoseSequence | None = None) -> SimulatedR
         solids=solids,
         meshes=meshes,
         materials=materials,
-        spectrum=_spectrum(scene, materials),
+        spectrum=spectrum,
         detector=_detector(scene.detector, scene.scanner.binning),
         seed=scene.seed,
         spot=FocalSpot(**_without_units(scene.source.spot)),
@@ -69,6 +69,12 @@ def simulate(scene: S.Scene, *, poses: PoseSequence | None = None) -> SimulatedR
         ball_diameter=None if ball is None else ball.diameter_mm,
         engine=scene.engine,
     )
+
+
+def beam(scene: S.Scene) -> tuple[Spectrum, Mapping[str, Material]]:
+    """The spectrum as the scene's detector weighs it, and what the names of materials mean there."""
+    materials = {**MATERIALS, **{name: _material(part) for name, part in scene.materials.items()}}
+    return _spectrum(scene, materials), materials
 
 
 def _without_units(part: S.Part) -> dict[str, Any]:
