@@ -69,7 +69,7 @@ def test_the_same_bytes_whatever_does_the_work(run: tuple[Scanner, list[np.ndarr
     assert same(here, detect((i for i in images), scanner, workers=2))
     assert same(here, detect(Stack(images), scanner, workers=2))
     with (
-        distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
+        distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=":0") as cluster,
         distributed.Client(cluster) as client,
     ):
         assert same(here, detect(Stack(images), scanner, executor=client))

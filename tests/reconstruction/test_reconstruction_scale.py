@@ -123,7 +123,7 @@ def test_a_cluster_is_the_whole():
     whole = run(subset_size=6)
     with (
         distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None, memory_limit=None
+            n_workers=2, threads_per_worker=1, processes=False, dashboard_address=":0", memory_limit=None
         ) as cluster,
         distributed.Client(cluster) as client,
     ):

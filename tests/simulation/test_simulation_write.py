@@ -89,7 +89,7 @@ def test_a_whole_stack_of_another_scene_is_no_beginning(run, tmp_path):
 def test_a_dask_cluster_makes_the_same_bytes(run, tmp_path):
     distributed = pytest.importorskip("distributed")
     with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=":0") as cluster,
         distributed.Client(cluster) as client,
     ):
         write_run(tmp_path / "cluster", run, client=client)
