@@ -33,7 +33,8 @@ def _require_same_pivot(calibration: Calibration, poses: PoseSequence) -> None:
         )
 
 
-def _require_same_scanner(calibration: Calibration, scanner: Scanner) -> None:
+def require_same_scanner(calibration: Calibration, scanner: Scanner) -> None:
+    """InputError, naming the parameter, where a scan's scanner is not the calibration's."""
     own = calibration.scanner
     freed = {p.name for p in calibration.parameters}
     for name in ("n_u", "n_v", *PARAMETER_UNITS):
@@ -102,7 +103,7 @@ def projection_matrices(
     """
     _require_same_pivot(calibration, poses)
     if scanner is not None:
-        _require_same_scanner(calibration, scanner)
+        require_same_scanner(calibration, scanner)
     commanded = poses
     scale = float(calibration.manipulator.get("translation_scale", 1.0))
     if calibration.model != "rigid" or "kind" in calibration.manipulator:

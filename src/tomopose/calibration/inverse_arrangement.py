@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,9 +12,9 @@ from tomopose.calibration.kinematic import calibrate_kinematic, machine_of
 from tomopose.calibration.residuals import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.result import Calibration
 from tomopose.calibration.solve import calibrate
-from tomopose.errors import InputError
+from tomopose.errors import InputError, NotObservableError
 from tomopose.geometry.scanner import Scanner
-from tomopose.manipulator.error_models import corrected_poses
+from tomopose.manipulator.error_models import MOVING_SCANNER, corrected_poses
 from tomopose.manipulator.inverse import InverseManipulator, inverse_poses
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
@@ -27,6 +29,7 @@ def calibrate_inverse(
     manipulator: Any = None,
     model: str = "auto",
     d_SD_sigma: float = 0.0,
+    distances: Mapping[tuple[int, int], tuple[float, float]] | None = None,
     **options: Any,
 ) -> Calibration:
     """Find the scanner's mount on the moved plate and the ball in the base.  Eq. (6) over the inverse chain.
@@ -35,29 +38,52 @@ def calibrate_inverse(
     ----------
     scanner, observations: as in `calibrate`; d_SR is only the origin of W in the scanner's own frame.
     poses:        T_MH of the plate that carries source and detector; the table angle must be 0.
-    manipulator, model: as in `calibrate`.
+    manipulator, model, distances: as in `calibrate`.
     d_SD_sigma:   mm, standard deviation of d_SD from view to view; 0: source and detector are fixed to one another.
+                  The result's `extra` then holds "view_d_SD", the distance of every view.
     options:      free, fix, priors, robust of `calibrate`.
 
     Returns
     -------
     A calibration whose T_HT is the mount (moved plate -> T) and whose ball is given in the base.  Matrices of a scan:
     `projection_matrices(calibration, inverse_poses(scan))`; their points are points of the standing object.
+
+    Raises
+    ------
+    As `calibrate`; NotObservableError for what says only where W begins.
     """
     if np.asarray(poses.alpha).any():
         raise InputError("the arrangement with a standing object has no rotary table; alpha must be 0 in every pose")
     if not (np.isfinite(d_SD_sigma) and d_SD_sigma >= 0):
         raise InputError(f"d_SD_sigma is {d_SD_sigma}; a standard deviation >= 0 in mm is needed")
-    turned = inverse_poses(poses)
-    rigid = calibrate(scanner, turned, observations, model="rigid", hypotheses=False, **options)
+    if d_SD_sigma and model == "slack":
+        raise InputError("a d_SD that differs from view to view cannot be told from poses that scatter (model slack)")
+    for name in options.get("free", ()):
+        if name == "d_SR" or name.startswith("axis"):
+            raise NotObservableError(
+                f"{name} says only where W begins on a scanner that moves as a whole; no image depends on it beside "
+                "the mount", direction=name,
+            )
     machine = machine_of(manipulator)
-    if machine is None and not d_SD_sigma and model in ("auto", "rigid"):
-        return rigid
-    return calibrate_kinematic(
-        scanner, turned, observations, rigid=rigid,
-        manipulator=None if machine is None else InverseManipulator(machine=machine),
-        model="rigid" if machine is None and model == "auto" else model,
-        view_sigma={"d_SD": d_SD_sigma} if d_SD_sigma else None,
+    if distances and (model == "rigid" or (model == "auto" and machine is None)):
+        raise InputError("distances between balls serve models with the manipulator's errors; give its geometry")
+    turned = inverse_poses(poses)
+    found = calibrate(scanner, turned, observations, model="rigid", hypotheses=False, **options)
+    if machine is not None or d_SD_sigma or model not in ("auto", "rigid"):
+        found = calibrate_kinematic(
+            scanner, turned, observations, rigid=found,
+            manipulator=None if machine is None else InverseManipulator(machine=machine),
+            model="rigid" if machine is None and model == "auto" else model, distances=distances, inverse=True,
+            view_sigma={"d_SD": d_SD_sigma} if d_SD_sigma else None,
+        )
+    block = {**found.manipulator, "arrangement": MOVING_SCANNER}
+    if not d_SD_sigma:
+        return replace(found, manipulator=block)
+    seen = observations.select(np.isin(observations.pose_id, found.pose_id))
+    d_SD, u = view_distances(found, poses, seen, d_SD_sigma=d_SD_sigma)
+    views = {"pose_id": list(seen.pose_id), "d_SD_mm": d_SD.tolist(), "u_mm": u.tolist()}
+    return replace(
+        found, manipulator={**block, "view_sigma": {"d_SD": d_SD_sigma}}, extra={**found.extra, "view_d_SD": views}
     )
 
 

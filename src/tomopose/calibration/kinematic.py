@@ -56,6 +56,7 @@ def calibrate_kinematic(
     free: FreeParameters | None = None,
     distances: Mapping[tuple[int, int], tuple[float, float]] | None = None,
     view_sigma: Mapping[str, float] | None = None,
+    inverse: bool = False,
     robust: bool = True,
 ) -> Calibration:
     """Find the mount, the balls and the manipulator's errors together: a maximum a posteriori estimate.
@@ -71,6 +72,7 @@ def calibrate_kinematic(
     free:         freed scanner parameters with priors; by default those of the rigid calibration.
     distances:    (ball id, ball id) -> (distance, standard uncertainty), mm: scale bars.
     view_sigma:   scanner parameter -> standard deviation of its scatter from view to view.
+    inverse:      the table holds inverse poses, those of a scanner that moves.
     robust:       set aside centres that do not belong.
 
     Raises
@@ -91,10 +93,10 @@ def calibrate_kinematic(
         data=data,
         poses=pose_rows(data, poses),
         free=freed,
-        bars=_known_bars(distances, data),
+        bars=known_bars(distances, data),
         view_sigma=dict(view_sigma or {}),
         repeatability=Repeatability() if machine is None else machine.repeatability,
-        inverse=isinstance(machine, InverseManipulator),
+        inverse=inverse or isinstance(machine, InverseManipulator),
     )
     start = State(
         T_HT=rigid.T_HT,
@@ -111,7 +113,7 @@ def calibrate_kinematic(
     doubts = _sound_run(fits, problem)
     judged = {name: judge(name, fit) for name, fit in fits.items()}
     chosen = _choose(model, judged)
-    if chosen == "rigid" and model == "auto":
+    if chosen == "rigid" and model == "auto" and not (problem.bars or problem.view_sigma):
         block = {**rigid.manipulator, "scatter": scatter_block(fits["rigid"])}
         return replace(rigid, manipulator=block, extra={**rigid.extra, **comparison(judged, fits, chosen)})
     return calibration_of(rigid, fits, judged, chosen, model, data.pose_id, doubts)
@@ -167,9 +169,10 @@ def _freed_values(rigid: Calibration, free: FreeParameters) -> Array:
     return np.array([found.get(name, value) for name, value in zip(free.names, free.value, strict=True)])
 
 
-def _known_bars(
+def known_bars(
     distances: Mapping[tuple[int, int], tuple[float, float]] | None, data: Problem
 ) -> dict[tuple[int, int], tuple[float, float]]:
+    """The scale bars, checked against the balls that were observed."""
     bars = {}
     for (a, b), (length, u) in dict(distances or {}).items():
         missing = [i for i in (a, b) if i not in data.ball_ids]

@@ -164,19 +164,19 @@ def linearise(problem: KinematicProblem, state: State) -> Linearised:
 
 
 def _linearise_twin(problem: KinematicProblem, twin: TwinRobots, state: State) -> Linearised:
-    """The same for twin robots, whose source moves against the panel; nothing of the scanner is free there."""
-    data = problem.data
+    """The same for twin robots, whose source moves against the panel; of the scanner only the pitches may be free."""
+    data, free = problem.data, problem.free
     n, nb = len(problem.poses), len(data.ball_ids)
-    b = twin_blocks(
-        data.scanner, twin, T_HT=state.T_HT, poses=problem.poses, p=state.p, t=state.balls[data.ball]
-    )
+    (scanner,) = adjusted_scanners(data.scanners, free, state.delta)
+    b = twin_blocks(scanner, twin, T_HT=state.T_HT, poses=problem.poses, p=state.p, t=state.balls[data.ball])
     J_balls = np.zeros((n, 2, nb, 3))
     J_balls[np.arange(n), :, data.ball] = b.J_t
     scatter = (b.J_plate * problem.repeatability.variance) @ np.swapaxes(b.J_plate, 1, 2) + b.C_source
     C = data.covariance + problem.scatter * scatter
     if problem.weight is not None:
         C = C / problem.weight[:, None, None]
-    J = np.concatenate([b.J_mount, J_balls.reshape(n, 2, 3 * nb), b.J_p], axis=2)
+    J_free = b.J_scanner[:, :, free.cols] * free.factor
+    J = np.concatenate([b.J_mount, J_balls.reshape(n, 2, 3 * nb), J_free, b.J_p], axis=2)
     return Linearised(r=data.x_D - b.x_D, J=J, C=C, J_pose=b.J_plate)
 
 

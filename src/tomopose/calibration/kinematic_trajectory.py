@@ -13,7 +13,7 @@ import numpy as np
 from tomopose.calibration.residuals import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.result import Calibration
 from tomopose.geometry.rotations import exp_rotation, skew
-from tomopose.manipulator.error_models import correction
+from tomopose.manipulator.error_models import correction, moving_scanner
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.units import Array
 
@@ -111,18 +111,24 @@ def scatter_of(calibration: Calibration) -> Array:
 
 
 def scatter_variance(calibration: Calibration, poses: PoseSequence, x_M: Any) -> Array:
-    """(n, m, 2) px^2: what the plate's scatter from pose to pose adds to points x_M (m, 3) of the object.
+    """(n, m, 2) px^2: what the plate's scatter from pose to pose adds to points x_M (m, 3) of the object, and that of
+    scanner parameters from view to view.
 
     poses: where the plate stands (corrected).
     """
-    variance, T_MH = scatter_of(calibration), poses.T_MH
+    variance, T_MH, block = scatter_of(calibration), poses.T_MH, calibration.manipulator
+    views = {SCANNER_COLUMNS.index(name): float(sigma) for name, sigma in block.get("view_sigma", {}).items()}
     V = np.zeros((len(poses), len(x_M), 2))
-    if variance.any():
+    if variance.any() or views:
+        # the scatter that the poses' residuals alone give (pose_noise) turns about the plate's origin in the table
+        about_H = "scatter" in block and moving_scanner(block)
         for i, x in enumerate(np.asarray(x_M, dtype=np.float64)):
             b = projection_blocks(calibration.scanner, T_HT=calibration.T_HT, T_MH=T_MH, t=x, alpha=poses.alpha)
-            lever = b.x_H if calibration.manipulator.get("kind") == "inverse" else b.x_H - T_MH.t
+            lever = b.x_H if about_H else b.x_H - T_MH.t
             J = np.concatenate([-b.G_H @ skew(lever), b.G_H], axis=2)
             V[:, i] = (J**2) @ variance
+            for column, sigma in views.items():
+                V[:, i] += (sigma * b.J_scanner[:, :, column]) ** 2
     return V
 
 

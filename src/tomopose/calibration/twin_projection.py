@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tomopose.calibration.residuals import SCANNER_COLUMNS
 from tomopose.errors import InputError
 from tomopose.geometry.rotations import skew
 from tomopose.geometry.scanner import Scanner
@@ -26,14 +27,16 @@ from tomopose.units import Array
 @dataclass(frozen=True, kw_only=True)
 class TwinBlocks:
     """x_D (n, 2) px, NaN where the ball is behind the source; J_mount (n, 2, 6), J_t (n, 2, 3) by the ball, J_p
-    (n, 2, m) by the errors, J_plate (n, 2, 6) by turns about and shifts of the detector's flange; C_source (n, 2, 2)
-    px^2 of the source robot's scatter; source (n, 3): d."""
+    (n, 2, m) by the errors, J_plate (n, 2, 6) by turns about and shifts of the detector's flange, J_scanner
+    (n, 2, columns) by the pixel pitches, 0 elsewhere; C_source (n, 2, 2) px^2 of the source robot's scatter; source
+    (n, 3): d."""
 
     x_D: Array
     J_mount: Array
     J_t: Array
     J_p: Array
     J_plate: Array
+    J_scanner: Array
     C_source: Array
     source: Array
 
@@ -96,12 +99,17 @@ def twin_blocks(
     ], axis=1)
     J_pose = g_ball @ ball.J_pose + g_spot @ spot.J_pose
     by_spot = g_spot @ spot.J_point
+    x_D = np.stack([scanner.u_0 + f_u * (a + l * (x - a)), scanner.v_0 + f_v * (b + l * (y - b))], axis=1)
+    J_scanner = np.zeros((len(x_D), 2, len(SCANNER_COLUMNS)))
+    J_scanner[:, 0, SCANNER_COLUMNS.index("p_u")] = (scanner.u_0 - x_D[:, 0]) / scanner.p_u
+    J_scanner[:, 1, SCANNER_COLUMNS.index("p_v")] = (scanner.v_0 - x_D[:, 1]) / scanner.p_v
     return TwinBlocks(
-        x_D=np.stack([scanner.u_0 + f_u * (a + l * (x - a)), scanner.v_0 + f_v * (b + l * (y - b))], axis=1),
+        x_D=x_D,
         J_mount=g_ball @ ball.J_mount + g_spot @ spot.J_mount,
         J_t=g_ball @ ball.J_point,
         J_p=J_pose @ real.J + by_spot @ place.J,
         J_plate=g_ball @ ball.J_plate + g_spot @ spot.J_plate,
+        J_scanner=J_scanner,
         C_source=by_spot @ place.covariance @ np.swapaxes(by_spot, 1, 2),
         source=spot.x,
     )
@@ -123,3 +131,13 @@ def twin_view_matrices(
     R = T_HS.R @ real.R
     t = real.t @ T_HS.R.T + T_HS.t - spot
     return K @ np.concatenate([R, t[:, :, None]], axis=2)
+
+
+def balls_from_rays(P: Array, x_D: Array, ball: Array, count: int) -> Array:
+    """(count, 3): where the rays of each ball's observed centres x_D (n, 2) meet best, given matrices P (n, 3, 4)."""
+    A = P[:, :2] - x_D[:, :, None] * P[:, 2:]
+    places = []
+    for k in range(count):
+        rows = A[ball == k].reshape(-1, 4)
+        places.append(np.linalg.lstsq(rows[:, :3], -rows[:, 3], rcond=None)[0])
+    return np.array(places)

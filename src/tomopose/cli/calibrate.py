@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -23,13 +23,21 @@ from tomopose.cli.common import (
     RowsOption,
     Say,
     ScannerOption,
+    SourcePosesOption,
     WorkersOption,
     arguments,
     either,
     names,
 )
 
-EPILOG = "Example: tomopose calibrate --scanner scanner.json --poses poses.csv --images radiographs/ --out cal/"
+EPILOG = (
+    "Example: tomopose calibrate --scanner scanner.json --poses poses.csv --images radiographs/ --out cal/\n\n"
+    "C-arm: tomopose calibrate --arrangement moving-scanner --manipulator robot.json --scanner scanner.json --poses "
+    "poses.csv --observations observations.csv --out cal/\n\n"
+    "Twin robots: tomopose calibrate --twin twin.json --poses detector.csv --source-poses source.csv --scanner "
+    "scanner.json --observations observations.csv --out cal/"
+)
+ARRANGEMENTS = ("moving-object", "moving-scanner")
 
 SCALE_BAR = re.compile(r"(?P<a>\d+),(?P<b>\d+)=(?P<mm>\d+\.?\d*)\((?P<u>\d*\.?\d+)\)")
 
@@ -47,6 +55,30 @@ def scale_bars(texts: list[str] | None) -> dict[tuple[int, int], tuple[float, fl
             raise typer.BadParameter(f"{text!r} is not ID,ID=MM(U)", param_hint="--distance")
         bars[int(found["a"]), int(found["b"])] = float(found["mm"]), float(found["u"])
     return bars or None
+
+
+def forward_of(machine: Any) -> Any:
+    """The forward kinematics of a robot with joint values, for tables that hold nothing else."""
+    return machine.forward if hasattr(machine, "joints") else None
+
+
+def require_arrangement(
+    arrangement: str, distance_sigma: float, twin: Path | None, source_poses: Path | None, manipulator: Path | None
+) -> bool:
+    """Whether one manipulator carries the scanner; a usage error where the options contradict one another."""
+    if arrangement not in ARRANGEMENTS:
+        raise typer.BadParameter(f"{arrangement!r} is none of {', '.join(ARRANGEMENTS)}", param_hint="--arrangement")
+    if (twin is None) != (source_poses is None):
+        lost, there = ("--twin", "--source-poses") if twin is None else ("--source-poses", "--twin")
+        raise typer.BadParameter(f"{there} needs {lost}: twin robots have a description and two tables",
+                                 param_hint=lost)
+    moving = arrangement == "moving-scanner"
+    if twin is not None and (manipulator is not None or moving):
+        raise typer.BadParameter("twin.json names both robots and says what moves; leave out --manipulator and "
+                                 "--arrangement", param_hint="--twin")
+    if distance_sigma and not moving:
+        raise typer.BadParameter("serves --arrangement moving-scanner", param_hint="--d-sd-sigma-mm")
+    return moving
 
 
 def calibrate(
@@ -72,6 +104,22 @@ def calibrate(
         list[str] | None,
         typer.Option("--distance", help="Scale bar between two balls, ID,ID=MM(U), as in 0,1=25.000(0.001)."),
     ] = None,
+    arrangement: Annotated[
+        str,
+        typer.Option("--arrangement", help="What the manipulator carries: moving-object, or moving-scanner (source "
+                     "and detector; C-arm, gantry), where the ball stands still."),
+    ] = "moving-object",
+    distance_sigma: Annotated[
+        float,
+        typer.Option("--d-sd-sigma-mm", min=0.0, help="With moving-scanner: scatter of d_SD from view to view, one "
+                     "more number a view; 0: source and detector are fixed to one another."),
+    ] = 0.0,
+    twin: Annotated[
+        Path | None,
+        typer.Option("--twin", help="twin.json: source and detector on a robot each; --poses is then the detector's "
+                     "table."),
+    ] = None,
+    source_poses: SourcePosesOption = None,
     dark: DarkOption = None,
     flat: FlatOption = None,
     dataset: DatasetOption = None,
@@ -99,16 +147,19 @@ def calibrate(
         write_calibration_folder,
     )
     from tomopose.errors import NotConvergedError
+    from tomopose.manipulator.twin_file import read_twin
     from tomopose.provenance import provenance
 
     either(images, observations)
+    moving = require_arrangement(arrangement, distance_sigma, twin, source_poses, manipulator)
     say = Say(json=as_json, quiet=quiet)
     require_free_folder(out, force=force)
     bars = scale_bars(distance)
     geometry = tp.read_scanner(scanner)
     errors = None if manipulator is None else tp.read_manipulator(manipulator)
+    twins = None if twin is None else read_twin(twin)
     # A table of joint values alone becomes poses by the robot's own kinematics.
-    sequence = tp.read_poses(poses, forward=getattr(errors, "forward", None) if hasattr(errors, "joints") else None)
+    sequence = tp.read_poses(poses, forward=forward_of(errors if twins is None else twins.detector))
     stack = None
     if observations is not None:
         observed = tp.read_observations(observations)
@@ -118,24 +169,35 @@ def calibrate(
             dark=dark, flat=flat, dataset=dataset, rows=rows, raw=raw,
         )
         observed = observe(say, geometry, stack, sequence, ball_diameter=ball_diameter, workers=workers)
+    given: dict[str, Any] = {"model": model, "free": names(free), "fix": names(fix), "distances": bars}
     try:
-        result = tp.calibrate(
-            geometry, sequence, observed, manipulator=errors, model=model, free=names(free), fix=names(fix),
-            distances=bars,
-        )
+        if twins is not None and source_poses is not None:
+            robots = twins.robots(tp.read_poses(source_poses, forward=forward_of(twins.source)))
+            result = tp.calibrate_twin(
+                geometry, sequence, observed, twin=robots, mount=twins.mount(geometry), **given
+            )
+        elif moving:
+            result = tp.calibrate_inverse(
+                geometry, sequence, observed, manipulator=errors, d_SD_sigma=distance_sigma, **given
+            )
+        else:
+            result = tp.calibrate(geometry, sequence, observed, manipulator=errors, **given)
     except NotConvergedError as error:
         # what was reached is rejected, and its report says why
         if not isinstance(error.calibration, tp.Calibration):
             raise
         result = error.calibration
-    given = [scanner, poses, *(p for p in (observations, manipulator) if p is not None)]
     made = provenance(
-        inputs=given,
+        inputs=[scanner, poses, *(p for p in (observations, manipulator, twin, source_poses) if p is not None)],
         arguments=arguments(model=model, free=free, fix=fix, distance=distance, ball_diameter_mm=ball_diameter,
-                            images=None if images is None else len(observed)),
+                            images=None if images is None else len(observed),
+                            arrangement="twin" if twins is not None else arrangement,
+                            d_sd_sigma_mm=distance_sigma or None),
     )
     result = replace(result, provenance=made)
-    write_calibration_folder(out, result, observed, sequence, images=stack, force=force)
+    # where the scanner moves, the report's chain runs through the inverse poses, as the calibration's does
+    shown = tp.inverse_poses(sequence) if moving or twins is not None else sequence
+    write_calibration_folder(out, result, observed, shown, images=stack, force=force)
     summary, lines = calibration_summary(result)
     say.result({"out": out.name, **summary}, [*lines, f"{out}: calibration.json, observations.csv, report.html"])
     return exit_code(result)

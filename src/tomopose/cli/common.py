@@ -22,6 +22,10 @@ QuietOption = Annotated[bool, typer.Option("--quiet", help="Print nothing but er
 ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")]
 ScannerOption = Annotated[Path, typer.Option("--scanner", help="scanner.json: the scanner's known geometry.")]
 PosesOption = Annotated[Path, typer.Option("--poses", help="poses.csv: the manipulator's poses, one row an image.")]
+SourcePosesOption = Annotated[
+    Path | None,
+    typer.Option("--source-poses", help="Twin robots: poses or joint values of the source's robot, by pose_id."),
+]
 WorkersOption = Annotated[int, typer.Option("--workers", min=1, help="Processes to use.")]
 ImagesOption = Annotated[
     str | None, typer.Option("--images", help="Folder, glob or multi-page file of radiographs.")

@@ -3,17 +3,48 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from tomopose.cli.common import OK, ForceOption, JsonOption, PosesOption, QuietOption, Say, arguments
+from tomopose.cli.common import (
+    OK,
+    ForceOption,
+    JsonOption,
+    PosesOption,
+    QuietOption,
+    Say,
+    SourcePosesOption,
+    arguments,
+)
 
-EPILOG = "Example: tomopose matrices --calibration cal/calibration.json --poses scan.csv --binning 2 --out matrices.npz"
+EPILOG = (
+    "Example: tomopose matrices --calibration cal/calibration.json --poses scan.csv --binning 2 --out matrices.npz\n\n"
+    "Twin robots: tomopose matrices --calibration cal/calibration.json --poses scan.csv --source-poses "
+    "scan_source.csv --out matrices.npz"
+)
 
 
 def register(app: typer.Typer) -> None:
     app.command("matrices", epilog=EPILOG)(matrices)
+
+
+def require_tables(
+    cal: Any, path: Path, *, source_poses: Path | None, home: str | None, commands: Path | None
+) -> None:
+    """InputError where the tables and options do not fit the calibration's arrangement."""
+    from tomopose.errors import InputError
+
+    twins = cal.manipulator.get("kind") == "twin"
+    if twins and source_poses is None:
+        raise InputError(f"{path} is of twin robots; --source-poses with the source robot's table is missing")
+    if not twins and source_poses is not None:
+        raise InputError(f"{path} is not of twin robots; --source-poses belongs to a calibration made with --twin")
+    if twins and (home is not None or commands is not None):
+        raise InputError("twin robots: W is that of the first view, and commands are not corrected; leave out --home "
+                         "and --commands")
+    if commands is not None and cal.model == "rigid":
+        raise InputError(f"{path} holds no errors of the manipulator; command the poses as they are")
 
 
 def matrices(
@@ -32,6 +63,12 @@ def matrices(
         str | None,
         typer.Option("--home", help="pose_id at which the object has its coordinates in W; default: zero."),
     ] = None,
+    source_poses: SourcePosesOption = None,
+    manipulator: Annotated[
+        Path | None,
+        typer.Option("--manipulator", help="robot.json (or twin.json): for tables of joint values alone, where the "
+                     "calibration trusts the robot and does not hold it."),
+    ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
@@ -39,39 +76,51 @@ def matrices(
     """Turn a scan's poses into one 3x4 projection matrix a view, with the predicted uncertainty in pixels.
 
     Refuses a scan with another pivot or another scanner than the calibration's.  A robot's zero is far from the
-    scanner: name one of its poses as --home.
+    scanner: name one of its poses as --home.  Where the calibration is one of a moving scanner or of twin robots, the
+    tables are those of the same plates, and W stands still with the object; for twins it is W of the first view.
     """
     import numpy as np
 
     import tomopose as tp
-    from tomopose.errors import InputError
+    from tomopose.cli.calibrate import forward_of
     from tomopose.files import require_absent
-    from tomopose.manipulator.error_models import correction
+    from tomopose.manipulator.error_models import machines_of
+    from tomopose.manipulator.twin_file import read_twin
     from tomopose.provenance import provenance
 
     say = Say(json=as_json, quiet=quiet)
     require_absent(out, force=force)
-    cal, scan = tp.read_calibration(calibration), tp.read_poses(poses)
+    cal = tp.read_calibration(calibration)
+    require_tables(cal, calibration, source_poses=source_poses, home=home, commands=commands)
     if commands is not None:
         require_absent(commands, force=force)
-        if cal.model == "rigid":
-            raise InputError(f"{calibration} holds no errors of the manipulator; command the poses as they are")
-    at_home = None
-    if home is not None:
-        real = tp.corrected_poses(cal.manipulator, scan)
-        at_home = real.T_MH[int(real.index_of([home])[0])]
-    result = tp.projection_matrices(
-        cal, scan, binning=binning, scanner=None if scanner is None else tp.read_scanner(scanner), home=at_home
-    )
-    inputs = [calibration, poses, *([scanner] if scanner else [])]
+    machine, other = machines_of(cal.manipulator)
+    if manipulator is not None:
+        drawn = read_twin(manipulator) if source_poses is not None else None
+        machine, other = (drawn.detector, drawn.source) if drawn else (tp.read_manipulator(manipulator), None)
+    scan = tp.read_poses(poses, forward=forward_of(machine))
+    given: dict[str, Any] = {"binning": binning, "scanner": None if scanner is None else tp.read_scanner(scanner)}
+    if source_poses is not None:
+        from tomopose.calibration.twin_robots import twin_notes
+
+        source = tp.read_poses(source_poses, forward=forward_of(other))
+        result, notes = tp.twin_matrices(cal, scan, source, **given), twin_notes(cal, scan, source)
+    else:
+        from tomopose.manipulator.error_models import correction, moving_scanner
+
+        turn = tp.inverse_poses if moving_scanner(cal.manipulator) else lambda table: table
+        scan = turn(scan)
+        real = correction(cal.manipulator, scan)
+        at_home = None if home is None else real.poses.T_MH[int(real.poses.index_of([home])[0])]
+        result, notes = tp.projection_matrices(cal, scan, home=at_home, **given), real.notes
+    inputs = [calibration, poses, *(p for p in (source_poses, scanner) if p is not None)]
     tp.write_matrices(
         out, result, provenance=provenance(inputs=inputs, arguments=arguments(binning=binning, home=home)), force=force
     )
     if commands is not None:
-        tp.write_poses(commands, tp.commands_for(cal.manipulator, scan), force=force)
-    if "kind" in cal.manipulator:
-        for note in correction(cal.manipulator, scan).notes:
-            say.note(f"note: {note}")
+        tp.write_poses(commands, turn(tp.commands_for(cal.manipulator, scan)), force=force)
+    for note in notes:
+        say.note(f"note: {note}")
     sigma, shared = (
         None if s is None else float(np.sqrt(np.mean(s**2))) for s in (result.points_sigma, result.points_sigma_shared)
     )
@@ -87,7 +136,7 @@ def matrices(
          "calibration_verdict": cal.verdict},
         [f"{out}: {len(result)} matrices for images of {result.n_u} x {result.n_v} px; uncertainty {told}"],
     )
-    if home is None and (result.P[:, 2, 3] <= 0).any():
+    if home is None and source_poses is None and (result.P[:, 2, 3] <= 0).any():
         say.note("note: at the machine's zero the W origin lies behind the source; a pose of the scan as --home puts "
                  "the object near it")
     if cal.verdict != "trustworthy":

@@ -8,6 +8,8 @@
      "lag": {"names", "values"} of worn guides and drives, where the run showed it: it follows the direction from which
      a table's poses are approached, in their order,
      "translation_scale": factor on the plate's shifts, where it was freed and is not 1,
+    "arrangement": "moving-scanner" where source and detector move, and poses are inverse ones,
+    "view_sigma": {"d_SD": mm}: scatter of a scanner parameter from view to view,
      "range": {"t_mm": [low (3), high (3)], "w_rad": [low, high]}: of the calibration's poses}
 
 Home of eq. (5) stays the identity: M is the frame that equals H when the controller's zero pose is executed without
@@ -27,7 +29,7 @@ from tomopose.errors import InputError, OutOfReachError
 from tomopose.geometry.rotations import log_rotation
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.files import hexapod_from_document, serial_from_document
-from tomopose.manipulator.inverse import InverseManipulator
+from tomopose.manipulator.inverse import InverseManipulator, inverse_poses
 from tomopose.manipulator.pose_map import PoseMap
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import ErrorModel, RealPoses, Repeatability, moved
@@ -35,6 +37,8 @@ from tomopose.manipulator.run_effects import with_run_effects
 from tomopose.manipulator.serial import SerialRobot
 from tomopose.units import Array
 
+MOVING_SCANNER = "moving-scanner"
+"""Block's "arrangement" where source and detector move and the object stands still."""
 RANGE_MARGIN = 0.1
 """Of the calibrated range's width: as far outside a pose still counts as inside."""
 COMMAND_STEPS = 30
@@ -62,8 +66,6 @@ class Correction:
 
 def manipulator_block(model: ErrorModel, p: Array, u: Array, poses: PoseSequence) -> dict[str, Any]:
     """The block above for errors p (m,) with standard uncertainties u, found with `poses`."""
-    w = log_rotation(poses.T_MH.R)
-    t = poses.T_MH.t
     return {
         "kind": model.kind,
         "nominal": model.to_json(),
@@ -71,10 +73,16 @@ def manipulator_block(model: ErrorModel, p: Array, u: Array, poses: PoseSequence
         "values": np.asarray(p).tolist(),
         "units": list(model.units),
         "u": np.asarray(u).tolist(),
-        "range": {
-            "t_mm": [t.min(axis=0).tolist(), t.max(axis=0).tolist()],
-            "w_rad": [w.min(axis=0).tolist(), w.max(axis=0).tolist()],
-        },
+        "range": pose_range(poses),
+    }
+
+
+def pose_range(poses: PoseSequence) -> dict[str, Any]:
+    """Lowest and highest shift and rotation vector of a table, as in the block's "range"."""
+    t, w = poses.T_MH.t, log_rotation(poses.T_MH.R)
+    return {
+        "t_mm": [t.min(axis=0).tolist(), t.max(axis=0).tolist()],
+        "w_rad": [w.min(axis=0).tolist(), w.max(axis=0).tolist()],
     }
 
 
@@ -111,6 +119,22 @@ def machine_from_block(kind: str, nominal: Mapping[str, Any], where: str) -> Err
     raise InputError(f"{where} has kind {kind!r}; hexapod, serial, map and inverse are known")
 
 
+def machines_of(manipulator: Mapping[str, Any]) -> tuple[ErrorModel | None, ErrorModel | None]:
+    """The nominal machines of a block, without errors: the manipulator's, or those of detector and source of twins;
+    None where it holds none."""
+    where, nominal = "calibration: manipulator", manipulator.get("nominal", {})
+    if manipulator.get("kind") == "twin":
+        twins = {
+            who: machine_from_block(block["kind"], {k: v for k, v in block.items() if k != "kind"}, where)
+            for who, block in nominal.items() if who in ("detector", "source")
+        }
+        return twins.get("detector"), twins.get("source")
+    if "kind" not in manipulator:
+        return None, None
+    machine = machine_from_block(manipulator["kind"], nominal, where)
+    return (machine.machine if isinstance(machine, InverseManipulator) else machine), None
+
+
 def _executed(
     manipulator: Mapping[str, Any], poses: PoseSequence, moves: PoseSequence
 ) -> tuple[RealPoses, tuple[str, ...]]:
@@ -140,15 +164,10 @@ def correction(manipulator: Mapping[str, Any], poses: PoseSequence) -> Correctio
     scale = float(manipulator.get("translation_scale", 1.0))
     T_MH = replace(real.T_MH, t=scale * real.t)
     J = np.concatenate([real.J[:, :3], scale * real.J[:, 3:]], axis=1)
-    outside = _outside(manipulator["range"], poses)
-    notes: tuple[str, ...] = ()
-    if outside.any():
-        first = int(np.flatnonzero(outside)[0])
-        notes = (
-            f"{int(outside.sum())} of {n} poses lie outside the range in which the manipulator's errors were "
-            f"identified, the first is {poses.pose_id[first]!r}; there the correction rests on the model alone",
-        )
-    return Correction(poses=replace(poses, T_MH=T_MH), J=J, names=names, outside=outside, notes=notes)
+    outside = outside_range(manipulator["range"], poses)
+    return Correction(
+        poses=replace(poses, T_MH=T_MH), J=J, names=names, outside=outside, notes=outside_notes(outside, poses)
+    )
 
 
 def corrected_poses(manipulator: Mapping[str, Any], poses: PoseSequence) -> PoseSequence:
@@ -164,6 +183,9 @@ def commands_for(manipulator: Mapping[str, Any], wanted: PoseSequence) -> PoseSe
     """
     if "kind" not in manipulator:
         return wanted
+    if manipulator["kind"] == "inverse" and "lag" not in manipulator:
+        inner = {**manipulator, "kind": manipulator["nominal"]["kind"], "nominal": manipulator["nominal"]["machine"]}
+        return inverse_poses(commands_for(inner, inverse_poses(wanted)))
     model, _ = model_from_block(manipulator)
     command = replace(wanted, q=None)
     extra = None
@@ -194,9 +216,26 @@ def commands_for(manipulator: Mapping[str, Any], wanted: PoseSequence) -> PoseSe
     )
 
 
-def _outside(limits: Mapping[str, Any], poses: PoseSequence) -> Any:
+def outside_range(limits: Mapping[str, Any], poses: PoseSequence) -> Any:
+    """(n,) bool: the pose lies outside a block's "range", with a margin."""
     x = np.concatenate([poses.T_MH.t, log_rotation(poses.T_MH.R)], axis=1)
     low = np.concatenate([limits["t_mm"][0], limits["w_rad"][0]])
     high = np.concatenate([limits["t_mm"][1], limits["w_rad"][1]])
     margin = RANGE_MARGIN * (high - low) + np.repeat([1e-3, 1e-6], 3)
     return ((x < low - margin) | (x > high + margin)).any(axis=1)
+
+
+def outside_notes(outside: Any, poses: PoseSequence, whose: str = "the manipulator's") -> tuple[str, ...]:
+    """The sentence on poses outside the range in which `whose` errors were identified; none where all lie inside."""
+    if not outside.any():
+        return ()
+    return (
+        f"{int(outside.sum())} of {len(poses)} poses lie outside the range in which {whose} errors were identified, "
+        f"the first is {poses.pose_id[int(np.flatnonzero(outside)[0])]!r}; there the correction rests on the model "
+        "alone",
+    )
+
+
+def moving_scanner(manipulator: Mapping[str, Any]) -> bool:
+    """Whether the block is of a manipulator that carries source and detector, so that tables hold inverse poses."""
+    return manipulator.get("arrangement") == MOVING_SCANNER or manipulator.get("kind") == "inverse"

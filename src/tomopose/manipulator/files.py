@@ -50,6 +50,8 @@ def read_manipulator(path: str | Path) -> Hexapod | SerialRobot:
     newer = [error for error in found.values() if "newer" in str(error)]
     if newer:
         raise newer[0]
+    if "tomopose/twin/" in str(found["hexapod"]):
+        raise SchemaVersionError(f"{path} describes twin robots; give it as --twin, with --source-poses", path=path)
     raise SchemaVersionError(
         f'{path} describes no manipulator: "schema" must be "tomopose/hexapod/1" or "tomopose/serial/1"', path=path
     )
@@ -65,7 +67,7 @@ def write_manipulator(
 
 def hexapod_from_document(document: Mapping[str, Any], where: str) -> Hexapod:
     """A hexapod from the content of hexapod.json."""
-    _require_keys(document, HEXAPOD_KEYS, where, {"base_joints_m", "platform_joints_m", "base_joints"})
+    require_keys(document, HEXAPOD_KEYS, where, {"base_joints_m", "platform_joints_m", "base_joints"})
     joints = {name: _joints(document, name, where) for name in ("base_joints_mm", "platform_joints_mm")}
     confirmed = document.get("units") == "confirmed"
     for name, xyz in joints.items():
@@ -95,7 +97,7 @@ def hexapod_from_document(document: Mapping[str, Any], where: str) -> Hexapod:
             raise UnitError(f"{where}: {key} is {sigma[key]:g} mm; were micrometres meant? {CONFIRM}")
     limits = document.get("leg_limits_mm")
     if limits is not None:
-        limits = _array(limits, (2,), "leg_limits_mm", where)
+        limits = vector(limits, (2,), "leg_limits_mm", where)
         if not limits[0] < limits[1]:
             raise InputError(f"{where}: leg_limits_mm is {limits.tolist()}; (shortest, longest) is needed")
     return Hexapod(
@@ -115,7 +117,7 @@ def hexapod_from_document(document: Mapping[str, Any], where: str) -> Hexapod:
 
 def serial_from_document(document: Mapping[str, Any], where: str) -> SerialRobot:
     """A serial robot from the content of robot.json."""
-    _require_keys(document, SERIAL_KEYS, where, {"q_start_rad", "tool_mm"})
+    require_keys(document, SERIAL_KEYS, where, {"q_start_rad", "tool_mm"})
     joints = document.get("joints")
     if not isinstance(joints, list) or not joints:
         raise ShapeError(f'{where}: "joints" is needed, a list with one object for each joint')
@@ -131,13 +133,13 @@ def serial_from_document(document: Mapping[str, Any], where: str) -> SerialRobot
         raise InputError(f'{where}: "convention" is {convention!r}; "dh" or "modified-dh" must be declared')
     q_start = document.get("q_start_deg")
     if q_start is not None:
-        q_start = _array(q_start, (len(made),), "q_start_deg", where)
+        q_start = vector(q_start, (len(made),), "q_start_deg", where)
         q_start = np.where([j.kind == "turning" for j in made], np.radians(q_start), q_start)
     tool = document.get("tool")
     return SerialRobot(
         joints=made,
         convention=convention,
-        tool=None if tool is None else _array(tool, (4, 4), "tool", where),
+        tool=None if tool is None else vector(tool, (4, 4), "tool", where),
         q_start=q_start,
         repeatability=_repeatability(document, where),
     )
@@ -146,7 +148,7 @@ def serial_from_document(document: Mapping[str, Any], where: str) -> SerialRobot
 def _joint(block: Any, where: str, confirmed: bool) -> Joint:
     if not isinstance(block, Mapping):
         raise InputError(f"{where} is no object with a_mm, alpha_deg, d_mm, theta_offset_deg")
-    _require_keys(block, JOINT_KEYS, where, {"a_m", "d_m", "alpha_rad", "theta_offset_rad", "a", "alpha", "d"})
+    require_keys(block, JOINT_KEYS, where, {"a_m", "d_m", "alpha_rad", "theta_offset_rad", "a", "alpha", "d"})
     numbers = {key: _number(block, key, None, where) for key in ("a_mm", "alpha_deg", "d_mm")}
     offset = _number(block, "theta_offset_deg", 0.0, where)
     for key, angle in (("alpha_deg", numbers["alpha_deg"]), ("theta_offset_deg", offset)):
@@ -177,7 +179,7 @@ def _repeatability(document: Mapping[str, Any], where: str) -> Repeatability:
         return Repeatability()
     if not isinstance(block, Mapping):
         raise InputError(f'{where}: "repeatability" is an object with t_mm and w_rad')
-    _require_keys(block, ("t_mm", "w_rad"), f"{where}: repeatability", set())
+    require_keys(block, ("t_mm", "w_rad"), f"{where}: repeatability", set())
     standard = Repeatability()
     return Repeatability(
         t_mm=_number(block, "t_mm", standard.t_mm, where), w_rad=_number(block, "w_rad", standard.w_rad, where)
@@ -190,7 +192,7 @@ def _joints(document: Mapping[str, Any], name: str, where: str) -> Array:
         raise ShapeError(f"{where}: {name} is needed: six joints of three coordinates, mm")
     if len(rows) != 6:
         raise ShapeError(f"{where}: {name} holds {len(rows)} joints; a hexapod has 6")
-    return _array(rows, (6, 3), name, where)
+    return vector(rows, (6, 3), name, where)
 
 
 def _require_distinct(apart: Array, name: str, where: str) -> None:
@@ -199,7 +201,8 @@ def _require_distinct(apart: Array, name: str, where: str) -> None:
         raise InputError(f"{where}: {name}: joints {i + 1} and {j + 1} are the same point; one of them is mistyped")
 
 
-def _require_keys(document: Mapping[str, Any], known: Iterable[str], where: str, other_units: set[str]) -> None:
+def require_keys(document: Mapping[str, Any], known: Iterable[str], where: str, other_units: set[str]) -> None:
+    """InputError for an unknown key, UnitError for one of `other_units`."""
     known = tuple(known)
     for key in document:
         if key in known:
@@ -223,7 +226,8 @@ def _finite(value: Any, key: str, where: str) -> float:
     return float(value)
 
 
-def _array(value: Any, shape: tuple[int, ...], name: str, where: str) -> Array:
+def vector(value: Any, shape: tuple[int, ...], name: str, where: str) -> Array:
+    """Finite numbers of that shape, or ShapeError or InputError."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
