@@ -83,19 +83,42 @@ def corner_problems(folder: Path, corners: Any) -> list[Problem]:
     ]
 
 
+def _normalised(d: np.ndarray, C: np.ndarray) -> np.ndarray:
+    """(n,) squared distances of d (n, c) in units of the covariances C (n, c, c)."""
+    return np.asarray(np.einsum("ni,ni->n", d, np.linalg.solve(C, d[:, :, None])[..., 0]))
+
+
+def birge_ratio(R: np.ndarray, t: np.ndarray, C: np.ndarray, c: int) -> float:
+    """Root of chi2 over its degrees of freedom for n mounts about their weighted mean, of the first c of (rotation,
+    translation): the Birge ratio (R. T. Birge, Phys. Rev. 40 (1932) 207), 1 where independent mounts scatter as stated.
+    """
+    W = np.linalg.inv(C[:, :c, :c])
+    U, _, V = np.linalg.svd(R.mean(axis=0))
+    R_mean, t_mean = U @ V, t.mean(axis=0)
+    for _ in range(20):
+        e = np.concatenate([log_rotation(R @ R_mean.T), t - t_mean], axis=1)[:, :c]
+        step = np.concatenate([np.linalg.solve(W.sum(axis=0), np.einsum("nij,nj->i", W, e)), np.zeros(6 - c)])
+        R_mean, t_mean = exp_rotation(step[:3]) @ R_mean, t_mean + step[3:]
+    return float(np.sqrt(_normalised(e, C[:, :c, :c]).sum() / (c * (len(t) - 1))))
+
+
 def _median_ratio(d: np.ndarray, C: np.ndarray) -> float:
     """Median of the normalised distances of d (n, c) over that of chi2 with c degrees of freedom, as a root."""
-    q = np.einsum("ni,ni->n", d, np.linalg.solve(C, d[:, :, None])[..., 0])
-    return float(np.sqrt(np.median(q) / chdtri(d.shape[1], 0.5)))
+    return float(np.sqrt(np.median(_normalised(d, C)) / chdtri(d.shape[1], 0.5)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Spread:
-    """Robust normalised spread of mounts about their median: 1 where the stated covariances are right."""
+    """Spread of mounts over their stated uncertainty, for the rotation alone and for all six coordinates.
+
+    rotation, mount: Birge ratios, about the weighted mean; median_rotation, median_mount: of medians, about the median,
+    which single corners do not move.
+    """
 
     rotation: float
     mount: float
-    rotation_rms_urad: float
+    median_rotation: float
+    median_mount: float
 
 
 def normalised_spread(fits: list[Fit], covariances: list[np.ndarray]) -> Spread:
@@ -104,12 +127,10 @@ def normalised_spread(fits: list[Fit], covariances: list[np.ndarray]) -> Spread:
     centre = U @ V
     for _ in range(10):
         centre = exp_rotation(np.median(log_rotation(R @ centre.T), axis=0)) @ centre
-    w = log_rotation(R @ centre.T)
-    e = np.concatenate([w, t - np.median(t, axis=0)], axis=1)
-
+    e = np.concatenate([log_rotation(R @ centre.T), t - np.median(t, axis=0)], axis=1)
     return Spread(
-        rotation=_median_ratio(w, C[:, :3, :3]), mount=_median_ratio(e, C[:, :6, :6]),
-        rotation_rms_urad=float(1e6 * np.sqrt((w**2).sum(axis=1).mean())),
+        rotation=birge_ratio(R, t, C, 3), mount=birge_ratio(R, t, C, 6),
+        median_rotation=_median_ratio(e[:, :3], C[:, :3, :3]), median_mount=_median_ratio(e, C[:, :6, :6]),
     )
 
 
@@ -127,8 +148,8 @@ def together(problems: list[Problem]) -> Problem:
 
 
 def by_chance(problems: list[Problem], free: Any, fits: list[Fit], field: PoseField, draws: int = 400) -> np.ndarray:
-    """(draws, 2): the two normalised spreads where the model is the truth, to first order: every draw has one error a
-    pose, which all corners share."""
+    """(draws, 2): the two Birge ratios where the model is the truth, to first order: every draw has one error a pose,
+    which all corners share."""
     n, rng = len(problems[0]), np.random.default_rng(0)
     shares = field_shares(problems[0], field)
     roots = [np.linalg.cholesky(share + 1e-12 * np.trace(share) * np.eye(n)) for share in shares]
@@ -142,6 +163,7 @@ def by_chance(problems: list[Problem], free: Any, fits: list[Fit], field: PoseFi
         parts.append((G, L, (C @ J.T @ Vi)[:6]))
         covariances.append(C[:6, :6])
     C6 = np.array(covariances)
+    weights = {c: np.linalg.inv(C6[:, :c, :c]) for c in (3, 6)}
     spreads = []
     for _ in range(draws):
         e_t, e_w = (root @ rng.standard_normal((n, 3)) for root in roots)
@@ -150,8 +172,12 @@ def by_chance(problems: list[Problem], free: Any, fits: list[Fit], field: PoseFi
                  + rng.normal(0, CORNER_SIGMA_PX, (n, 2))).ravel()
             for G, L, A in parts
         ])
-        e = e - np.median(e, axis=0)
-        spreads.append((_median_ratio(e[:, :3], C6[:, :3, :3]), _median_ratio(e, C6)))
+        row = []
+        for c, W in weights.items():
+            mean = np.linalg.solve(W.sum(axis=0), np.einsum("nij,nj->i", W, e[:, :c]))
+            chi2 = _normalised(e[:, :c] - mean, C6[:, :c, :c]).sum()
+            row.append(float(np.sqrt(chi2 / (c * (len(e) - 1)))))
+        spreads.append(row)
     return np.array(spreads)
 
 

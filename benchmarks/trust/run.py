@@ -315,11 +315,12 @@ def robot(shared: Path) -> None:
     r = study(folder)
     low, middle, high = r["chance"]
     print(f"\nReal robot with a camera, {r['corners']} corners, each alone (residual {r['residual_px']:.2f} px): "
-          "robust spread of the mounts over the stated uncertainty")
-    print(f"{'uncertainty from':44s} {'rotation':>9s} {'all six':>8s}")
+          "spread of the mounts over the stated uncertainty, Birge ratio (of medians)")
+    print(f"{'uncertainty from':44s} {'rotation':>15s} {'all six':>15s}")
     for words, s in (("J^T J, scaled to the residuals", r["plain"]), ("the robot's errors modelled", r["modelled"])):
-        print(f"{words:44s} {s.rotation:9.2f} {s.mount:8.2f}")
-    print(f"by chance, were the model true: rotation {low[0]:.2f} to {high[0]:.2f} (median {middle[0]:.2f}), "
+        print(f"{words:44s} {s.rotation:7.2f} ({s.median_rotation:5.2f}) {s.mount:7.2f} ({s.median_mount:5.2f})")
+    print("Birge ratio by chance, were the model true: "
+          f"rotation {low[0]:.2f} to {high[0]:.2f} (median {middle[0]:.2f}), "
           f"all six {low[1]:.2f} to {high[1]:.2f} (median {middle[1]:.2f})")
     print(f"the robot's errors: {described(r['field'])}")
 

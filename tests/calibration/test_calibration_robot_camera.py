@@ -28,6 +28,7 @@ def test_spread_of_mounts_agrees_with_the_stated_uncertainty(study, shared_data)
     # J^T J takes the robot's errors as independent: too small
     assert found["plain"].rotation > 1.4
     assert found["plain"].mount > 1.4
-    # all corners share the errors of 28 poses: within what chance allows, and no longer too small
+    # no longer too small; medians, beside them, may be smaller: all corners share the errors of the same 28 poses
     assert 0.8 <= found["modelled"].rotation <= 1.25
-    assert 0.6 <= found["modelled"].mount <= 1.25
+    assert 0.8 <= found["modelled"].mount <= 1.25
+    assert 0.6 <= found["modelled"].median_mount <= 1.25

@@ -32,7 +32,7 @@ from tomopose.errors import InputError, NotConvergedError
 from tomopose.geometry.rotations import exp_rotation, rotation_angle_between, skew
 from tomopose.units import Array
 
-ITERATIONS = 60
+ITERATIONS = 200
 EVALUATIONS = 400
 BOUND = 12.0
 """Largest logarithm of a component against its unit that the search tries."""
