@@ -1,14 +1,16 @@
 """How often stated 95 % intervals of lengths hold the truth over virtual scans: simulated, reconstructed, measured.
 
-    NUMBA_NUM_THREADS=1 nice -n 10 python benchmarks/measurement/virtual_scans.py [--objects 8] [--runs 30] [--draws 20]
+    NUMBA_NUM_THREADS=1 nice -n 10 python benchmarks/measurement/virtual_scans.py [--objects 40] [--runs 6]
+                                                                                  [--sets 12] [--draws 20]
 
 Two balls and a block of aluminium, 96^3 voxels of 0.1 mm, 120 views of the tilted scan of eq. (11), CNR about 15 in
 the volume.  Each object lies elsewhere by a part of a voxel and has sizes of its own; its scans differ by noise alone.
-The virtual CT's own draws are of the nominal object, each placed elsewhere, with noise.  Intervals:
+The uncertainty is that of `simulated_errors` for the nominal object and of `budget`, as `tomopose measure --simulate`
+states it; several sets of draws, so that the luck of one does not count.  Intervals:
 
     fit         of the single scan, from the scatter of its points
-    simulation  mean error of the draws taken off, u of the draws (JCGM 101), as for one more draw
-    combined    the same with the larger of both u
+    simulation  corrected by the draws of one set: mean over the sets, lowest and highest
+    all draws   corrected by the draws of all sets together
 """
 
 from __future__ import annotations
@@ -16,19 +18,22 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
-from scipy.stats import t as student
 
 import tomopose as tp
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
+from tomopose.measurement.budget import budget
 from tomopose.measurement.measure import measure
 from tomopose.measurement.plan import plan_from
+from tomopose.measurement.uncertainty import Simulated
 from tomopose.simulation.detector import expose
 from tomopose.simulation.run import signal
 from tomopose.simulation.scene import scene_from
+from tomopose.studies.simulated_uncertainty import simulated_errors
 
 VOXEL, SIZE, VIEWS = 0.1, 96, 120
 BALLS, RADIUS = np.array([[-2.13, 0.21, 1.55], [2.07, -0.34, 1.72]]), 1.2
 BLOCK, SIDES = np.array([0.17, -0.12, -1.63]), np.array([4.43, 3.57, 2.71])
+GRID = tp.VoxelGrid.cube(n=SIZE, spacing=VOXEL)
 SCANNER = {"d_SD_mm": 1000.0, "d_SR_mm": 200.0, "p_u_mm": 0.5, "p_v_mm": 0.52, "u_0_px": 62.7, "v_0_px": 64.2,
            "n_u_px": 128, "n_v_px": 126}
 
@@ -61,21 +66,20 @@ class VirtualPart:
                       **{f"L{a}": float(side) for a, side in zip("xyz", sides, strict=True)}}
         self.plan = plan_of(balls, block, sides)
 
-    def errors(self, seed):
-        """Name -> (error, U, u), mm, of one scan."""
+    def results(self, seed):
+        """Name -> result of one scan."""
         det = self.run.detector
         images = [expose(c, det, self.run.scanner, seed=seed, frame=k) / np.float32(det.white)
                   for k, c in enumerate(self.clean)]
-        volume = tp.reconstruct(images, self.matrices, tp.VoxelGrid.cube(n=SIZE, spacing=VOXEL),
-                                images_are="transmission", consistency="off")
-        found = measure(volume, self.plan).results
-        return {r.name: (r.value - self.truth[r.name], r.U, r.u) for r in found}
+        volume = tp.reconstruct(images, self.matrices, GRID, images_are="transmission", consistency="off")
+        return {r.name: r for r in measure(volume, self.plan).results}
 
 
 def plan_of(balls, block, sides):
     features = {f"ball {k}": {"kind": "sphere", "point": b.tolist(), "radius_mm": RADIUS, "n_points": 800}
                 for k, b in enumerate(balls)}
-    measurands = [{"name": "SD", "kind": "distance", "of": ["ball 0", "ball 1"]}]
+    measurands = [{"name": "SD", "kind": "distance", "of": ["ball 0", "ball 1"],
+                   "nominal_mm": float(np.linalg.norm(balls[1] - balls[0]))}]
     for a, name in enumerate("xyz"):
         u, v = (np.eye(3)[k] * sides[k] / 2 for k in ((a + 1) % 3, (a + 2) % 3))
         for sign, word in ((1, "+"), (-1, "-")):
@@ -84,51 +88,60 @@ def plan_of(balls, block, sides):
                 "kind": "plane", "point": (block + n * sides / 2).tolist(), "direction": n.tolist(), "u": u.tolist(),
                 "v": v.tolist(), "safety_mm": 0.45, "n_points": 500,
             }
-        measurands.append({"name": f"L{name}", "kind": "distance", "of": ["+" + name, "-" + name]})
+        measurands.append({"name": f"L{name}", "kind": "distance", "of": ["+" + name, "-" + name],
+                           "nominal_mm": float(sides[a])})
     return plan_from({"schema": "tomopose/measurement-plan/1", "unit": "mm", "features": features,
                       "measurands": measurands})
 
 
+def pooled(sets):
+    """All draws of several equally large sets as one simulation."""
+    n = sum(s.runs for s in sets)
+    means, u = np.array([s.mean for s in sets]), np.array([s.u for s in sets])
+    square = sum((s.runs - 1) * s.u**2 + s.runs * (s.mean - means.mean()) ** 2 for s in sets)
+    return Simulated(mean=float(means.mean()), u=float(np.sqrt(square / (n - 1))), low=np.nan, high=np.nan, runs=n,
+                     stable=False, seed=0, u_fit=float(np.sqrt(np.mean([s.u_fit**2 for s in sets]))),
+                     dof_fit=sum(s.dof_fit for s in sets)) if len(u) > 1 else sets[0]
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--objects", type=int, default=8)
-    parser.add_argument("--runs", type=int, default=30)
+    parser.add_argument("--objects", type=int, default=40)
+    parser.add_argument("--runs", type=int, default=6)
+    parser.add_argument("--sets", type=int, default=12)
     parser.add_argument("--draws", type=int, default=20)
     parser.add_argument("--snr", type=float, default=150.0)
     args = parser.parse_args()
+    nominal = VirtualPart(BALLS, BLOCK, SIDES, args.snr)
+    sets = [simulated_errors(nominal.run, nominal.plan, GRID, draws=args.draws, seed=k) for k in range(args.sets)]
     rows = {}
-    draws = {}
-    for k in range(args.draws):
-        rng = np.random.default_rng(np.random.SeedSequence([1, k]))
-        place = rng.uniform(-0.05, 0.05, 3)
-        part = VirtualPart(BALLS + place, BLOCK + place, SIDES, args.snr)
-        for name, (e, _, _) in part.errors(10_000 + k).items():
-            draws.setdefault(name, []).append(e)
     for k in range(args.objects):
-        rng = np.random.default_rng(np.random.SeedSequence([2, k]))
-        part = VirtualPart(*random_object(rng), args.snr)
+        part = VirtualPart(*random_object(np.random.default_rng(np.random.SeedSequence([2, k]))), args.snr)
         for run in range(args.runs):
-            for name, row in part.errors(1000 * k + run).items():
-                rows.setdefault(name, []).append((k, *row))
-        if len(rows["SD"]) > 1:
-            report(rows, draws)
+            for name, found in part.results(1000 * k + run).items():
+                rows.setdefault(name, []).append((found, part.truth[name]))
+    report(rows, sets)
 
 
-def report(rows, draws):
-    print(f"{len(rows['SD'])} scans; lengths in micrometres", flush=True)
+def held(result, truth, simulated=None):
+    """Whether the interval of a result, by the fit or by a simulation, holds the truth; and its half width."""
+    found = budget(result, simulated=simulated)
+    return abs(found.corrected - truth) <= found.U, found.U
+
+
+def report(rows, sets):
+    print(f"{len(rows['SD'])} scans, {len(sets)} sets of {sets[0]['SD'].runs} draws; lengths in micrometres")
     for name, found in rows.items():
-        _, e, U, u = np.array(found).T
-        sim = np.array(draws[name])
-        n = len(sim)
-        u_sim = sim.std(ddof=1) * np.sqrt(1 + 1 / n)
-        reach = student.ppf(0.975, n - 1)
-        held = {"fit": np.abs(e) <= U, "simulation": np.abs(e - sim.mean()) <= reach * u_sim,
-                "combined": np.abs(e - sim.mean()) <= np.maximum(U, reach * u_sim)}
-        objects = [e[np.array(found)[:, 0] == k].mean() for k in np.unique(np.array(found)[:, 0])]
-        print(f"  {name:3s} mean error {1000 * e.mean():+.2f}, scatter {1000 * e.std():.2f}, of objects' means "
-              f"{1000 * np.std(objects):.2f}, u of fit {1000 * np.sqrt(np.mean(u**2)):.2f}, simulated "
-              f"{1000 * sim.mean():+.2f} +- {1000 * u_sim:.2f}; held: "
-              + ", ".join(f"{k} {100 * h.mean():.1f} %" for k, h in held.items()), flush=True)
+        e = np.array([r.value - truth for r, truth in found])
+        u = np.sqrt(np.mean([r.u**2 for r, _ in found]))
+        each = [np.mean([held(r, truth, s[name])[0] for r, truth in found]) for s in sets]
+        whole = pooled([s[name] for s in sets])
+        fit, all_draws = (np.array([held(r, truth, s) for r, truth in found]) for s in (None, whole))
+        print(f"  {name:3s} mean error {1000 * e.mean():+.2f}, scatter {1000 * e.std(ddof=1):.2f}, u of fit "
+              f"{1000 * u:.2f}, simulated {1000 * whole.mean:+.2f} +- {1000 * whole.u:.2f} (its fits "
+              f"{1000 * whole.u_fit:.2f}); held: fit {100 * fit[:, 0].mean():.1f} %, simulation "
+              f"{100 * np.mean(each):.1f} % ({100 * np.min(each):.1f} to {100 * np.max(each):.1f}), all draws "
+              f"{100 * all_draws[:, 0].mean():.1f} %, U {1000 * all_draws[:, 1].mean():.2f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -14,16 +14,16 @@ import numpy as np
 
 from tomopose.files import atomic_folder, write_json, write_text
 from tomopose.measurement.alignment import Alignment
-from tomopose.measurement.budget import Budget, budget, half_width
+from tomopose.measurement.budget import FIT_ALONE, Budget, budget, half_width
 from tomopose.measurement.features import Feature
 from tomopose.measurement.uncertainty import Simulated
 from tomopose.provenance import Provenance
 
 SCHEMA = "measurement"
 COLUMNS = ("volume", "name", "kind", "value", "u", "U95", "unit", "reference", "u_reference", "error", "limit",
-           "within", "direction", "method")
-BUDGET_COLUMNS = ("volume", "name", "unit", "fit", "repeats", "calibration", "simulation", "mean_error", "corrected",
-                  "u", "dof", "U95")
+           "within", "direction", "method", "interval")
+BUDGET_COLUMNS = ("volume", "name", "unit", "value", "fit", "repeats", "calibration", "simulation", "mean_error",
+                  "corrected", "u", "dof", "U95", "interval")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,8 +60,13 @@ class MeasurementResult:
 
     @property
     def U(self) -> float:
-        """Half width of the 95 % interval of the value by the fit alone, by Student's t."""
+        """Half width of the 95 % interval of the value by the fit alone, by Student's t; `interval` says so."""
         return half_width(self.u, self.dof)
+
+    @property
+    def interval(self) -> str:
+        """What U holds, in words."""
+        return FIT_ALONE if math.isfinite(self.u) else "not determined"
 
     @property
     def within(self) -> bool | None:
@@ -73,7 +78,7 @@ class MeasurementResult:
             "volume": self.volume, "name": self.name, "kind": self.kind, "value": self.value, "u": self.u,
             "U95": self.U, "dof": self.dof, "unit": self.unit, "reference": self.reference,
             "u_reference": self.u_reference, "error": self.error, "limit": self.limit, "limit_rule": self.limit_rule,
-            "within": self.within, "direction": self.direction, "method": self.method,
+            "within": self.within, "direction": self.direction, "method": self.method, "interval": self.interval,
             "contributions": dict(self.contributions),
         }
 

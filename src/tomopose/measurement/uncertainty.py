@@ -7,6 +7,7 @@ calibration's covariance so become a covariance of points, without reconstructin
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -20,7 +21,11 @@ GAUSS_NEWTON = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Simulated:
-    """Result of a simulation: mean, u, shortest 95 % interval, number of runs, whether the tolerance was met, seed."""
+    """Result of a simulation: mean, u, shortest 95 % interval, number of runs, whether the tolerance was met, seed.
+
+    u_fit, dof_fit: what the virtual measurements' own fits state, rms, and its degrees of freedom; nan and 0 where they
+    state nothing;  with_calibration: whether calibrations were drawn too.
+    """
 
     mean: float
     u: float
@@ -29,6 +34,9 @@ class Simulated:
     runs: int
     stable: bool
     seed: int
+    u_fit: float = math.nan
+    dof_fit: float = 0.0
+    with_calibration: bool = False
 
 
 def displaced(P_used: Array, P_true: Array, points: Array) -> Array:

@@ -1,27 +1,32 @@
 """The uncertainty of measurands by simulation with the virtual CT (JCGM 101:2008).
 
 Each draw is a whole scan of the nominal object: photon noise of its own, matrices from a calibration drawn from its
-covariance, reconstruction on a grid shifted by a part of a voxel, since nobody knows where in its voxels a part lies,
-and measurement by the plan.  The noiseless images are made once: nothing of this changes them.
+covariance, reconstruction on a grid of its own, and measurement by the plan.  Nobody knows where within their voxels
+the two ends of a length lie.  The grid is therefore shifted by up to half a voxel, and its voxels are made up to 2 %
+larger or smaller: over 25 voxels that moves one end by half a voxel against the other, as another size of the part
+would.  The noiseless images are made once: nothing of this changes them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from tomopose.calibration.kinematic_trajectory import pixels, point_jacobian
 from tomopose.calibration.parameters import base_name
 from tomopose.calibration.residuals import SCANNER_COLUMNS
 from tomopose.calibration.result import Calibration
 from tomopose.errors import InputError
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
-from tomopose.geometry.rotations import exp_rotation
+from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.error_models import correction
+from tomopose.manipulator.real_poses import moved
 from tomopose.measurement.measure import measure
 from tomopose.measurement.plan import MeasurementPlan
 from tomopose.measurement.results import MeasurementResult
@@ -33,6 +38,9 @@ from tomopose.units import Array
 from tomopose.volume import Volume, VoxelGrid
 
 LEAST_DRAWS = 3
+VOXEL_SPREAD = 0.02
+"""Share by which the voxels of a draw are larger or smaller at most."""
+POSE_STEPS = 4
 
 
 def simulated_errors(
@@ -50,8 +58,11 @@ def simulated_errors(
 
     run:         the virtual scan (of `tomopose.simulate`), poses as believed and as they truly are.
     grid:        of the reconstructions: the real scan's, or a coarser one for a quick look.
-    calibration: rigid; its covariance is drawn from, about the run's own mount.  None: the mount is known exactly.
+    calibration: its covariance is drawn from, about the run's own mount and poses.  None: both are known exactly.
     options:     of `reconstruct`, such as algorithm and iterations.
+
+    Where the calibration holds errors of the manipulator, their covariance is drawn too.  Where the scene's manipulator
+    errs, its plate is then believed to stand where the calibration puts it, else where it was sent.
 
     The truth is the plan's nominal value (calibrated distances and diameters for a multi-sphere standard); without one
     the error is that from the mean of the draws, and its mean is nan.  Raises InputError for too few draws or for a
@@ -60,19 +71,17 @@ def simulated_errors(
     if draws < LEAST_DRAWS:
         raise InputError(f"{draws} draws; at least {LEAST_DRAWS} are needed for a standard deviation")
     bare = plan.model_copy(update={"repeats": {}})
-    found: dict[str, list[float]] = {}
-    truth: dict[str, float | None] = {}
+    found: dict[str, list[MeasurementResult]] = {}
     volumes = virtual_volumes(run, grid, draws=draws, calibration=calibration, seed=seed, options=options)
     for k, volume in enumerate(volumes):
         for r in measure(volume, bare).results:
-            found.setdefault(r.name, []).append(r.value)
-            truth[r.name] = _truth(plan, r)
+            found.setdefault(r.name, []).append(r)
         if progress is not None:
             progress(k + 1, draws)
     missing = [name for name, values in found.items() if len(values) != draws]
     if missing:
         raise InputError(f"not every virtual scan shows {', '.join(missing[:5])}; is the scene the plan's object?")
-    return {name: _summary(np.array(values), truth[name], seed) for name, values in found.items()}
+    return {name: _summary(rows, _truth(plan, rows[0]), seed, calibration is not None) for name, rows in found.items()}
 
 
 def virtual_volumes(
@@ -80,13 +89,13 @@ def virtual_volumes(
     options: Mapping[str, Any] | None = None,
 ) -> Iterator[Volume]:
     """Reconstructions of the run, each with noise, believed matrices and grid of its own; draw k is always the same."""
-    believed = _Believed(run, calibration)
     clean = [signal(run, i).astype(np.float32) for i in range(len(run))]
     for k in range(draws):
         sequence = np.random.SeedSequence([seed, k])
         noise, rng = int(sequence.generate_state(1)[0]), np.random.default_rng(sequence)
-        matrices = believed.matrices(rng)
-        shifted = replace(grid, centre=grid.centre + grid.spacing * rng.uniform(-0.5, 0.5, 3))
+        matrices = drawn_matrices(run, grid, calibration, rng)
+        shifted = replace(grid, centre=grid.centre + grid.spacing * rng.uniform(-0.5, 0.5, 3),
+                          spacing=grid.spacing * (1 + VOXEL_SPREAD * rng.uniform(-1, 1)))
         images = [expose(T.astype(np.float64), run.detector, run.scanner, seed=noise, frame=i)
                   for i, T in enumerate(clean)]
         white, dark = _levels(run, noise)
@@ -102,38 +111,66 @@ def _levels(run: SimulatedRun, seed: int) -> tuple[Any, Any]:
     return flat, dark
 
 
-@dataclass(frozen=True)
-class _Believed:
-    """The matrices that somebody with a drawn calibration would use."""
+def drawn_matrices(
+    run: SimulatedRun, grid: VoxelGrid, calibration: Calibration | None, rng: np.random.Generator
+) -> ProjectionMatrices:
+    """The matrices that somebody with a calibration drawn from its covariance would use; the run's own without one.
 
-    run: SimulatedRun
-    calibration: Calibration | None
+    The object's pose under them is the true one as nearly as it can be, over `grid`.  Errors as `simulated_errors`.
+    """
+    scanner = run.scanner
+    alpha = np.zeros(len(run)) if run.poses.alpha is None else run.poses.alpha
+    if calibration is None:
+        P = eq5_matrices(scanner, T_HT=run.T_HT, T_MH=run.poses.T_MH, alpha=alpha)
+    else:
+        _require_same_detector(scanner, calibration)
+        values, vectors = np.linalg.eigh(calibration.covariance)
+        delta = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
+        scanner, T_HT = _drawn(scanner, run.T_HT, calibration.tangent, delta)
+        drawn = eq5_matrices(scanner, T_HT=T_HT, T_MH=_drawn_poses(run, calibration, delta), alpha=alpha)
+        P = _object_held(drawn, eq5_matrices(run.scanner, T_HT=run.T_HT, T_MH=run.T_MH, alpha=alpha), grid)
+    return ProjectionMatrices(P=P, n_u=scanner.n_u, n_v=scanner.n_v, p_u=scanner.p_u, p_v=scanner.p_v,
+                              pose_id=run.poses.pose_id, scanner=scanner)
 
-    def __post_init__(self) -> None:
-        if self.calibration is None:
-            return
-        if self.calibration.model != "rigid":
-            raise InputError(
-                f"the calibration's model is {self.calibration.model}; virtual scans are drawn from rigid ones. Give "
-                "the manipulator's errors in the scene instead"
-            )
-        own, theirs = self.run.scanner, self.calibration.scanner
-        for name in ("n_u", "n_v", "p_u", "p_v"):
-            a, b = getattr(own, name), getattr(theirs, name)
-            if abs(a - b) > 1e-6 * abs(b) and not (name == "p_u" and "pitch_ratio" in self.calibration.tangent):
-                raise InputError(f"the scene's detector has {name} = {a:g}, the calibration's {b:g}; simulate the "
-                                 "detector that was calibrated (scanner.binning reads it out in blocks)")
 
-    def matrices(self, rng: np.random.Generator) -> ProjectionMatrices:
-        run, scanner, T_HT = self.run, self.run.scanner, self.run.T_HT
-        if self.calibration is not None:
-            values, vectors = np.linalg.eigh(self.calibration.covariance)
-            delta = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
-            scanner, T_HT = _drawn(scanner, T_HT, self.calibration.tangent, delta)
-        alpha = np.zeros(len(run)) if run.poses.alpha is None else run.poses.alpha
-        P = eq5_matrices(scanner, T_HT=T_HT, T_MH=run.poses.T_MH, alpha=alpha)
-        return ProjectionMatrices(P=P, n_u=scanner.n_u, n_v=scanner.n_v, p_u=scanner.p_u, p_v=scanner.p_v,
-                                  pose_id=run.poses.pose_id, scanner=scanner)
+def _require_same_detector(own: Scanner, calibration: Calibration) -> None:
+    for name in ("n_u", "n_v", "p_u", "p_v"):
+        a, b = getattr(own, name), getattr(calibration.scanner, name)
+        if abs(a - b) > 1e-6 * abs(b) and not (name == "p_u" and "pitch_ratio" in calibration.tangent):
+            raise InputError(f"the scene's detector has {name} = {a:g}, the calibration's {b:g}; simulate the "
+                             "detector that was calibrated (scanner.binning reads it out in blocks)")
+
+
+def _drawn_poses(run: SimulatedRun, calibration: Calibration, delta: Array) -> RigidTransform:
+    """Where the plate is believed to stand, after a step delta in the manipulator's errors."""
+    if "kind" not in calibration.manipulator:
+        return run.poses.T_MH
+    fixed = correction(calibration.manipulator, run.poses)
+    errs = not np.allclose(run.T_MH.matrix, run.poses.T_MH.matrix, atol=1e-9)
+    T = fixed.poses.T_MH if errs else run.poses.T_MH
+    R, t = moved(T.R, T.t, fixed.J @ delta[[calibration.tangent.index(name) for name in fixed.names]])
+    return replace(T, R=R, t=t)
+
+
+def _object_held(P: Array, P_true: Array, grid: VoxelGrid) -> Array:
+    """Matrices P (n, 3, 4) after the motion of the object that brings its images nearest to those under P_true.
+
+    Drawn errors may move the object as a whole, on which no length depends, out of reach of the plan's nominal places.
+    """
+    half = grid.spacing * np.array(grid.n_xyz) / 4
+    signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), axis=-1).reshape(-1, 3)
+    corners, seen = signs * half, pixels(P_true, grid.centre + signs * half)
+    motion = np.eye(4)
+    motion[:3, 3] = grid.centre
+    for _ in range(POSE_STEPS):
+        x = corners @ motion[:3, :3].T + motion[:3, 3]
+        G = point_jacobian(P, x)
+        J = np.concatenate([-G @ skew(x - motion[:3, 3]), G], axis=3).reshape(-1, 6)
+        step = np.linalg.lstsq(J, (seen - pixels(P, x)).ravel(), rcond=None)[0]
+        motion[:3, :3] = exp_rotation(step[:3]) @ motion[:3, :3]
+        motion[:3, 3] += step[3:]
+    motion[:3, 3] -= motion[:3, :3] @ grid.centre
+    return np.asarray(P @ motion)
 
 
 def _drawn(
@@ -158,8 +195,12 @@ def _truth(plan: MeasurementPlan, result: MeasurementResult) -> float | None:
     return result.reference
 
 
-def _summary(values: Array, truth: float | None, seed: int) -> Simulated:
+def _summary(rows: list[MeasurementResult], truth: float | None, seed: int, calibrated: bool) -> Simulated:
+    values = np.array([r.value for r in rows])
     errors = values - (values.mean() if truth is None else truth)
     low, high = shortest_interval(errors)
-    return Simulated(mean=math.nan if truth is None else float(errors.mean()), u=float(errors.std(ddof=1)), low=low,
-                     high=high, runs=len(errors), stable=False, seed=seed)
+    return Simulated(
+        mean=math.nan if truth is None else float(errors.mean()), u=float(errors.std(ddof=1)), low=low, high=high,
+        runs=len(errors), stable=False, seed=seed, u_fit=float(np.sqrt(np.mean([r.u**2 for r in rows]))),
+        dof_fit=float(np.sum([r.dof for r in rows])), with_calibration=calibrated,
+    )
