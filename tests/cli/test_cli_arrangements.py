@@ -116,9 +116,41 @@ def test_commands_move_the_scanner_where_it_was_wanted(gantry):
     assert commanded < plain / 10
 
 
-def test_the_wrong_arrangement_does_not_pass(gantry, capsys):
+def test_a_scanner_that_moves_is_named(gantry):
     folder = gantry[0]
-    assert calibrate(folder, "wrong", "--manipulator", folder / "hexapod.json") != 0
+    assert calibrate(folder, "wrong") == 3
+    reasons = " ".join(tp.read_calibration(folder / "wrong" / "calibration.json").reasons)
+    assert "it is the scanner that moves" in reasons
+    assert "--arrangement moving-scanner" in reasons
+
+
+def test_an_object_that_moves_is_named(files):
+    table = tp.read_poses(files.folder / "poses.csv")
+    (files.folder / "poses.csv").unlink()
+    (files.folder / "observations.csv").unlink()
+    still = replace(table, alpha=np.zeros(len(table)))
+    x = project_ball(files.scanner, T_HT=files.T_HT, T_MH=still.T_MH, t=[6.0, -4.0, 11.0])
+    tp.write_poses(files.folder / "poses.csv", still)
+    tp.write_observations(
+        files.folder / "observations.csv", tp.BallObservations.from_sigma(x, 0.01, pose_id=still.pose_id)
+    )
+    assert run([*files.calibrate("cal"), "--arrangement", "moving-scanner"]) == 3
+    reasons = " ".join(tp.read_calibration(files.folder / "cal" / "calibration.json").reasons)
+    assert "leave out --arrangement moving-scanner" in reasons
+
+
+def test_a_convention_that_is_wrong_is_found_for_a_moving_scanner_too(gantry):
+    """The signs of the angles belong to the table as it was written, not to its inverse."""
+    folder = gantry[0]
+    table = tp.read_poses(folder / "poses.csv")
+    (folder / "poses.csv").unlink()
+    angles = np.degrees(table.T_MH.angles) * [1, -1, 1]
+    tp.write_poses(
+        folder / "poses.csv", tp.PoseSequence.from_table(table.T_MH.t, angles, ball_id=table.ball_id)
+    )
+    assert calibrate(folder, "cal", "--arrangement", "moving-scanner", "--model", "rigid") == 3
+    best = tp.read_calibration(folder / "cal" / "calibration.json").hypotheses[0]
+    assert best["name"] == "sign of V"
 
 
 def test_one_more_number_a_view(gantry, scanner, rng):

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -111,6 +115,29 @@ def test_matrices_tell_the_shared_part_from_the_scatter(erring, capsys):
     assert run([*map(str, [*words, "--quiet", "--home", "nowhere", "--out", folder / "x.npz"])]) == 1
 
 
+def test_a_robot_alone_is_told_that_its_links_hold_the_scale(tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "benchmarks" / "manipulator"))
+    from manipulator_cases import robot_experiment
+
+    from tomopose.manipulator.virtual import typical_robot
+
+    robot = typical_robot()
+    for table, told in ((False, True), (True, False)):
+        folder = tmp_path / str(table)
+        folder.mkdir()
+        e = robot_experiment(robot, 0, n=100, table=table)
+        tp.write_scanner(folder / "scanner.json", e.scanner)
+        tp.write_poses(folder / "poses.csv", e.poses)
+        tp.write_observations(folder / "o.csv", e.observations)
+        write_manipulator(folder / "robot.json", robot)
+        words = ["calibrate", "--scanner", folder / "scanner.json", "--poses", folder / "poses.csv", "--observations",
+                 folder / "o.csv", "--manipulator", folder / "robot.json", "--out", folder / "cal"]
+        assert run([*map(str, words)]) == 0
+        text = capsys.readouterr().out
+        assert "errors of the manipulator" in text
+        assert ("use table angles or a known distance between two balls" in text) == told
+
+
 def test_plan_for_a_robot_says_what_the_table_angles_are_for(erring, capsys):
     from tomopose.manipulator.virtual import typical_robot
 
@@ -126,3 +153,91 @@ def test_plan_for_a_robot_says_what_the_table_angles_are_for(erring, capsys):
     assert len(plan) == 30
     assert plan.q is not None
     assert np.ptp(np.degrees(plan.q[:, 5])) > 180.0, "a robot turns about its tool"
+
+
+# -- what cannot be meant ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"base_joints_mm": [[0.0, 1.0, 2.0]] * 5}, "holds 5 joints; a hexapod has 6"),
+        ({"platform_joints_mm": "metres"}, "look like metres"),
+        ({"leg_limits_mm": [249.0, 251.0]}, "outside 249 to 251"),
+        ({"platform_joints_mm": "flat"}, "singular"),
+        ({"joint_sigma_mm": 100.0}, "were micrometres meant?"),
+        ({"joint_sigma_um": 100.0}, "unknown key 'joint_sigma_um'"),
+    ],
+)
+def test_platforms_that_cannot_be_stop_a_calibration(erring, capsys, change, told):
+    folder, machine, _, _, _ = erring
+    joints = {
+        "metres": (np.asarray(machine.platform_joints) / 1000).tolist(),
+        "flat": (np.asarray(machine.base_joints) * [0.5, 0.5, 1.0] + [0.0, 0.0, 240.0]).tolist(),
+    }
+    change = {k: joints.get(v, v) if isinstance(v, str) else v for k, v in change.items()}
+    path = folder / "hexapod.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    assert calibrate(folder, "--manipulator", path, "--out", folder / "cal") == 1
+    assert told in capsys.readouterr().err
+    assert not (folder / "cal").exists()
+
+
+def rewritten(folder, **columns):
+    """The pose table with columns exchanged."""
+    poses = tp.read_poses(folder / "poses.csv")
+    (folder / "poses.csv").unlink()
+    tp.write_poses(folder / "poses.csv", replace(poses, **columns))
+
+
+def test_exchanged_balls_and_a_new_pivot_are_named(erring, scanner, T_HT, capsys):
+    folder, machine, p, _, _ = erring
+    poses = tp.read_poses(folder / "poses.csv")
+    ball = np.arange(len(poses)) % 2
+    centres = np.array([[9.0, -7.0, 14.0], [-8.0, 6.0, -9.0]])
+    true = real_motion(machine, poses, p).T_MH
+
+    def image(T_MH):
+        x = project_ball(scanner, T_HT=T_HT, T_MH=T_MH, t=centres[ball], alpha=poses.alpha)
+        x = x + np.random.default_rng(1).normal(scale=0.01, size=x.shape)
+        seen = tp.BallObservations.from_sigma(x, 0.01, pose_id=poses.pose_id)
+        tp.write_observations(folder / "o.csv", seen, force=True)
+
+    words = ("--manipulator", folder / "hexapod.json", "--out", folder / "cal")
+    image(true)
+    said = ball.copy()
+    said[[10, 11]] = said[[11, 10]]
+    rewritten(folder, ball_id=said)
+    assert calibrate(folder, *words) == 1
+    assert "pose '10' is said to show ball 1 and shows ball 0" in capsys.readouterr().err
+    change = np.array([0.3, -0.2, 0.4])
+    t = true.t.copy()
+    t[60:] += change - true.R[60:] @ change
+    image(replace(true, t=t))
+    rewritten(folder, ball_id=ball)
+    assert calibrate(folder, *words) == 1
+    assert "from pose '60' on the pivot changed by" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("columns", "factor", "told"),
+    [
+        (5, 1.0, "joint values have shape (40, 5); (n, 6) are needed"),
+        (6, np.pi / 180, "look like radians"),
+        (6, 1.0, ""),
+    ],
+)
+def test_joint_tables_are_checked(erring, rng, capsys, columns, factor, told):
+    from tomopose.manipulator.virtual import typical_robot
+
+    folder, robot = erring[0], typical_robot()
+    write_manipulator(folder / "robot.json", robot)
+    q = np.degrees(robot.q_start + rng.uniform(-0.1, 0.1, (40, 6)))[:, :columns] * factor
+    rows = [f"{k}," + ",".join(map(repr, one.tolist())) for k, one in enumerate(q)]
+    head = "pose_id," + ",".join(f"q{k + 1}_deg" for k in range(columns))
+    (folder / "poses.csv").write_text("\n".join([head, *rows]) + "\n")
+    observed = tp.read_observations(folder / "o.csv").select(slice(0, 40))
+    tp.write_observations(folder / "o.csv", observed, force=True)
+    code = calibrate(folder, "--manipulator", folder / "robot.json", "--model", "rigid", "--out", folder / "cal")
+    assert code == (1 if told else 3), "centres of another machine fit no pose"
+    assert told in capsys.readouterr().err

@@ -15,7 +15,7 @@ import numpy as np
 
 from tomopose.calibration.estimate import best_fit
 from tomopose.calibration.fit import Fit, minimise, residuals
-from tomopose.calibration.initial import Rays, closed_form, other_starts, ray_equations
+from tomopose.calibration.initial import Rays, closed_form, other_starts, ray_equations, turned_about_beam
 from tomopose.calibration.integrity import SIGNIFICANT, chi2_with_movements, movements
 from tomopose.calibration.parameters import UNITS, FreeParameters, free_parameters
 from tomopose.calibration.problem import Problem, pair
@@ -127,7 +127,10 @@ def _rms(problem: Problem, fit: Fit, free: FreeParameters) -> float:
 
 def _fit_rival(problem: Problem, rays: Rays, free: FreeParameters, held: FreeParameters,
                starts: int) -> Fit:
-    fit = minimise(problem, held, closed_form(problem, rays), iterations=RIVAL_ITERATIONS)
+    start = closed_form(problem, rays)
+    fit = minimise(problem, held, start, iterations=RIVAL_ITERATIONS)
+    if not np.isfinite(fit.chi2):
+        fit = minimise(problem, held, turned_about_beam(problem, start[0], rays), iterations=RIVAL_ITERATIONS)
     if not np.isfinite(fit.chi2):
         # mirrored data have no closed form in front of the source; the residual they leave is still worth knowing
         others = (minimise(problem, held, start, iterations=RIVAL_ITERATIONS)

@@ -115,6 +115,14 @@ def closed_form(problem: Problem, rays: Rays) -> tuple[Array, Array, Array]:
     return R_HT, t_HT, t
 
 
+def turned_about_beam(problem: Problem, R_HT: Array, rays: Rays) -> tuple[Array, Array, Array]:
+    """The start half a turn about the beam from R_HT: what the closed form of nearly flat data may land on behind the
+    source, since only the weak change of magnification tells the two apart."""
+    beam = rays.source / np.linalg.norm(rays.source)
+    turned = (2 * np.outer(beam, beam) - np.eye(3)) @ R_HT
+    return (turned, *positions_for(problem, turned, rays))
+
+
 @functools.cache
 def _cube_rotations() -> Array:
     """(72, 3, 3): the 24 rotations of the cube, then the same turned by 45 degrees about (1,1,1) and (1,-1,0)."""

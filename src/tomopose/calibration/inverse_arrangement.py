@@ -11,6 +11,7 @@ import numpy as np
 from tomopose.calibration.kinematic import calibrate_kinematic, machine_of
 from tomopose.calibration.residuals import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.result import Calibration
+from tomopose.calibration.rivals import RIVALS_OF_MOVING_SCANNER
 from tomopose.calibration.solve import calibrate
 from tomopose.errors import InputError, NotObservableError
 from tomopose.geometry.scanner import Scanner
@@ -68,7 +69,7 @@ def calibrate_inverse(
     if distances and (model == "rigid" or (model == "auto" and machine is None)):
         raise InputError("distances between balls serve models with the manipulator's errors; give its geometry")
     turned = inverse_poses(poses)
-    found = calibrate(scanner, turned, observations, model="rigid", hypotheses=False, **options)
+    found = calibrate(scanner, turned, observations, model="rigid", hypotheses=RIVALS_OF_MOVING_SCANNER, **options)
     if machine is not None or d_SD_sigma or model not in ("auto", "rigid"):
         found = calibrate_kinematic(
             scanner, turned, observations, rigid=found,

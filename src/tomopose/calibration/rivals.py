@@ -208,7 +208,8 @@ def _list() -> tuple[Rival, ...]:
         for o in EULER_ORDERS
     ]
     frames = [
-        Rival(name="pose inverted", words="the poses map base to plate", cure=_POSES + "invert every pose",
+        Rival(name="pose inverted", words="the poses map base to plate, or it is the scanner that moves",
+              cure=_POSES + "invert every pose; where the scanner moves: --arrangement moving-scanner",
               change=_inverse, quick=True),
         Rival(name="rotation inverted", words="only the rotations are transposed",
               cure=_POSES + "transpose every rotation", change=_inverse_rotation, quick=True),
@@ -251,3 +252,20 @@ def _list() -> tuple[Rival, ...]:
 
 
 RIVALS = _list()
+
+
+def _over_inverse(rival: Rival) -> Rival:
+    def change(p: Problem) -> Problem | None:
+        changed = rival.change(_inverse(p))
+        return None if changed is None else _inverse(changed)
+
+    if rival.name != "pose inverted":
+        return replace(rival, change=change)
+    return replace(
+        rival, change=change, words="the object moves and the scanner stands still, or the poses map base to plate",
+        cure="leave out --arrangement moving-scanner, or poses.csv: invert every pose",
+    )
+
+
+RIVALS_OF_MOVING_SCANNER = tuple(_over_inverse(rival) for rival in RIVALS)
+"""The same readings of a table whose inverse poses stand in the problem."""

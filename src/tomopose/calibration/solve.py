@@ -26,7 +26,7 @@ from tomopose.calibration.problem import pair
 from tomopose.calibration.propagate import tilt_sigma
 from tomopose.calibration.residuals import SCANNER_COLUMNS
 from tomopose.calibration.result import Calibration, Parameter
-from tomopose.calibration.rivals import RIVALS
+from tomopose.calibration.rivals import RIVALS, Rival
 from tomopose.calibration.uncertainty import angles_by_tangent, widening
 from tomopose.calibration.verdict import Findings, verdict
 from tomopose.errors import InputError, NotConvergedError
@@ -178,7 +178,7 @@ def calibrate(
     fix: Sequence[str] = (),
     priors: Mapping[str, float] | None = None,
     robust: bool = True,
-    hypotheses: bool = True,
+    hypotheses: bool | Sequence[Rival] = True,
     pose_noise: Any = "auto",
     distances: Mapping[tuple[int, int], tuple[float, float]] | None = None,
     raise_on_failure: bool = True,
@@ -197,7 +197,7 @@ def calibrate(
     free, fix:    names of scanner parameters to estimate or to hold; see `parameters.UNITS`.
     priors:       name -> prior standard deviation (mm, px, rad), in place of the scanner's.
     robust:       set aside centres that do not belong, and list them.
-    hypotheses:   try the cheap rival conventions and say so in the verdict.
+    hypotheses:   try the cheap rival conventions (or those given) and say so in the verdict.
     pose_noise:   scatter of the manipulator about the poses it reports: "auto" estimates it where the residuals are
                   significantly above what the centres' covariances explain; (mm, rad) states it; None has none.
     distances:    (ball id, ball id) -> (distance, standard uncertainty), mm: scale bars.  With them the balls are
@@ -223,7 +223,8 @@ def calibrate(
     diagnosis = None
     if hypotheses:
         other = set_pose_rival(problem, poses)
-        quick = [r for r in (*RIVALS, *([other] if other else [])) if r.quick]
+        known = RIVALS if isinstance(hypotheses, bool) else hypotheses
+        quick = [r for r in (*known, *([other] if other else [])) if r.quick]
         diagnosis = ranked(stated.used, freed, stated.fit, quick, starts=0)
     arguments = {
         "model": model, "free": list(free), "fix": list(fix), "priors": dict(priors or {}), "robust": robust,

@@ -199,5 +199,7 @@ def calibrate(
     shown = tp.inverse_poses(sequence) if moving or twins is not None else sequence
     write_calibration_folder(out, result, observed, shown, images=stack, force=force)
     summary, lines = calibration_summary(result)
+    if "kind" in result.manipulator:
+        lines += [f"  {note}" for note in result.observability.notes]
     say.result({"out": out.name, **summary}, [*lines, f"{out}: calibration.json, observations.csv, report.html"])
     return exit_code(result)

@@ -91,6 +91,10 @@ def poses_from_table(
     commanded = _pose(table, convention, commanded=True, confirmed=confirmed)
     q = None
     if joints:
+        turning = [c for c in joints if c.endswith("_deg")]
+        if turning and not confirmed:
+            values = np.column_stack([table.numbers(c) for c in turning])
+            unit_checks.require_joint_degrees(values, f"{table.path}: {turning[0]} ... {turning[-1]}")
         q = np.column_stack([
             np.radians(table.numbers(c)) if c.endswith("_deg") else table.numbers(c) for c in joints
         ])

@@ -24,6 +24,7 @@ ENCODER_NOISE_MM, ENCODER_NOISE_DEG = 0.005, 0.002
 SMALLEST_PLAN_MM = 0.05
 LARGEST_POSITION_MM = 5000.0
 ONE_TURN = 2 * math.pi
+FEWEST_ROBOT_AXES = 4
 
 TABLE_CURE = "if the numbers are right, say so with a line '# units: confirmed' or units_confirmed=True"
 
@@ -51,6 +52,20 @@ def require_table_degrees(alpha: Array, where: str) -> None:
         raise UnitError(
             f"{where}: the table angles look like radians (largest {largest:g}, which is {math.degrees(largest):.4g} "
             f"deg if it is rad), but alpha_deg is in degrees; convert them, or {TABLE_CURE}"
+        )
+
+
+def require_joint_degrees(q: Array, where: str) -> None:
+    """UnitError if joint values (n, k) that should be degrees look like radians.
+
+    A robot of four or more axes of which none leaves +-6.28 deg works at its zero, which hardly any can.
+    """
+    largest = _largest(q)
+    few = q.shape[1] < FEWEST_ROBOT_AXES
+    if _whole_degrees_in_radians(q) or (not few and SMALLEST_PLAN_DEG < largest <= ONE_TURN):
+        raise UnitError(
+            f"{where}: the joint values look like radians (largest {largest:g}, which is {math.degrees(largest):.4g} "
+            f"deg if it is rad), but the columns are in degrees; convert them, or {TABLE_CURE}"
         )
 
 
