@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from tomopose.calibration.file_trust import averaged
 from tomopose.calibration.kinematic_fit import ModelFit, fit_model
 from tomopose.calibration.kinematic_result import calibration_of, comparison, scatter_block
 from tomopose.calibration.kinematic_solve import KinematicProblem, State
@@ -116,6 +117,7 @@ def calibrate_kinematic(
     if chosen == "rigid" and model == "auto" and not (problem.bars or problem.view_sigma):
         block = {**rigid.manipulator, "scatter": scatter_block(fits["rigid"])}
         return replace(rigid, manipulator=block, extra={**rigid.extra, **comparison(judged, fits, chosen)})
+    fits[chosen] = averaged(fits[chosen])
     return calibration_of(rigid, fits, judged, chosen, model, data.pose_id, doubts)
 
 
