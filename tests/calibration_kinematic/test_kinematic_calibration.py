@@ -16,7 +16,7 @@ from manipulator_cases import (
     scan_error,
 )
 
-from tomopose import BallObservations, Calibration
+from tomopose import BallObservations, Calibration, Frame, RigidTransform
 from tomopose.calibration.apply import projection_matrices
 from tomopose.calibration.kinematic import calibrate_kinematic, machine_of
 from tomopose.calibration.kinematic_design import plan_kinematic
@@ -25,6 +25,7 @@ from tomopose.calibration.kinematic_trajectory import object_points, rms_px, wit
 from tomopose.calibration.model_choice import EVIDENCE_GAIN
 from tomopose.calibration.solve import calibrate
 from tomopose.errors import InputError
+from tomopose.geometry.projection import project_ball
 from tomopose.io.calibration_json import read_calibration, write_calibration
 from tomopose.manipulator.error_models import commands_for, corrected_poses
 from tomopose.manipulator.virtual import Disturbance, typical_hexapod, typical_robot
@@ -144,6 +145,21 @@ def test_scale_of_a_robot_alone_is_as_good_as_its_links() -> None:
     assert any("all lengths of the robot together" in note for note in cal.observability.notes)
     table = found(robot_experiment(ROBOT, 1, table=True))
     assert not any("all lengths" in note for note in table.observability.notes)
+
+
+def test_a_robot_may_grow_about_the_source_unseen() -> None:
+    """All links, the ball's offset and the base's distance from the source, 1 % larger: not one centre moves."""
+    e = robot_experiment(ROBOT, 2, n=20)
+    T_HT = RigidTransform.from_angles([0.01, -0.02, 2.8], [-480.0, 20.0, -310.0], source=Frame.H, target=Frame.T)
+    ball, s = np.array([12.0, -14.0, 70.0]), 1.01
+    grown = replace(ROBOT, joints=tuple(replace(j, a=s * j.a, d=s * j.d) for j in ROBOT.joints))
+    T_TS = SCANNER.T_WS @ SCANNER.T_TW(0.0)
+    moved = replace(T_HT, t=s * T_HT.t + (s - 1) * T_TS.R.T @ T_TS.t)
+    seen, again = (
+        project_ball(SCANNER, T_HT=T, T_MH=robot.forward(e.poses.q), t=t)
+        for T, robot, t in ((T_HT, ROBOT, ball), (moved, grown, s * ball))
+    )
+    np.testing.assert_allclose(again, seen, atol=1e-9)
 
 
 def test_planned_poses_of_a_robot() -> None:
