@@ -88,6 +88,11 @@ def test_repeats_count_only_their_own_group(measured):
     assert {r["group"] for r in document["repeats"]} == {"3D scan"}
     assert {r["n"] for r in document["repeats"]} == {2}
     assert document["groups"] == {"3D scan": ["one", "two"]}
+    said = {r["name"]: r["interval"] for r in document["repeats"]}
+    assert said["L1"] == "repeats; mean error from the reference"
+    assert "repeats; without the systematic part" in said.values()
+    assert {r["interval"] for r in document["results"]} == {"fit alone, without the systematic part", "not determined"}
+    assert "fit alone, without the systematic part" in (measured / "report.html").read_text(encoding="utf-8")
     assert set(document["provenance"]["inputs"]) == {"repeats.toml", "scan1.h5", "scan2.h5", "scan3.h5", "part.stl"}
     shares = {(r["volume"], r["name"]): r for r in rows_of(measured / "uncertainty.csv")}
     assert shares["one", "L1"]["repeats"] != ""
@@ -164,6 +169,7 @@ def test_a_calibration_adds_its_share(folder):
     assert share > 0
     assert u == pytest.approx(np.hypot(fit, share))
     assert rows["flatness"]["calibration"] == ""
+    assert rows["L1"]["interval"] == "fit, calibration; without the systematic part"
     assert "Uncertainty" in (out / "report.html").read_text(encoding="utf-8")
     with pytest.raises(InputError, match="no volume is named"):
         run(folder / "plan.toml", "--volume", folder / "scan1.h5", "--out", folder / "n", "--quiet",
@@ -216,6 +222,12 @@ def test_virtual_scans_from_the_command_line(folder):
     value = json.loads((out / "measurement.json").read_text(encoding="utf-8"))["results"][0]["value"]
     assert float(length["corrected"]) == pytest.approx(value - float(length["mean_error"]))
     assert abs(float(length["mean_error"])) < 0.05
+    assert float(length["value"]) == value
+    assert length["interval"] == "virtual scans; corrected by simulation"
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "corrected by simulation / mm" in page
+    assert f'{float(length["corrected"]):.5f}' in page
+    assert f"{value:.5f}" in page
     document = json.loads((out / "measurement.json").read_text(encoding="utf-8"))
     assert document["simulated"]["L1"]["runs"] == 3
     assert document["provenance"]["seed"] == 4

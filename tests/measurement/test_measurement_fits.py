@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.rotations import exp_rotation
@@ -113,6 +114,32 @@ def test_common_errors_of_neighbours_widen_the_uncertainty_by_what_they_cost(len
     stated = np.array([f.covariance[2, 2] for f in fits])
     # Degrees of freedom say how well the variance itself is known: its relative variance is 2 / dof.
     assert np.std(stated) / np.mean(stated) < 1.5 * np.sqrt(2 / np.median([f.dof for f in fits]))
+
+
+@pytest.mark.parametrize("correlated", [True, False])
+def test_points_weigh_by_the_areas_they_stand_for(correlated):
+    """Half of the points crowd together.  The stated uncertainty is that of the mean weighed by areas, w' C w; where
+    neighbours share errors it is quieter than the mean of all points."""
+    rng = np.random.default_rng(9)
+    even, _ = plane_pattern([0, 0, 0], [0, 0, 1], [4, 0, 0], [0, 4, 0], 625)
+    crowds = rng.choice(even, 60)[rng.integers(0, 60, 625)] + np.array([0.1, 0.1, 0]) * rng.uniform(-1, 1, (625, 3))
+    points = np.concatenate([even, crowds])
+    fine, _ = plane_pattern([0, 0, 0], [0, 0, 1], [4.16, 0, 0], [0, 4.16, 0], 250_000)
+    area = np.maximum(np.bincount(cKDTree(points).query(fine)[1], minlength=len(points)), 0.1).astype(float)
+    d = np.linalg.norm(points[:, None] - points[None], axis=2)
+    C = (np.exp(-((d / 0.4) ** 2)) if correlated else np.zeros(d.shape)) + (1e-9 if correlated else 1) * np.eye(len(d))
+    root, w = np.linalg.cholesky(C), area / area.sum()
+    truth = 1e-4 * w @ C @ w
+    assert not correlated or truth < 0.7e-4 * C.mean()
+    stated = []
+    for _ in range(30):
+        moved = points + np.outer(root @ rng.standard_normal(len(points)), [0, 0, 0.01])
+        found = fit_plane(moved, area=area, correlation_range=2.0)
+        stated.append(found.covariance[2, 2])
+        assert np.allclose(found.point, w @ moved, atol=1e-9)
+    assert np.mean(stated) == pytest.approx(truth, rel=0.15)
+    with pytest.raises(InputError, match="area"):
+        fit_plane(points, area=area[1:])
 
 
 def test_differing_neighbours_narrow_it():

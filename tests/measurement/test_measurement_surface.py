@@ -97,6 +97,14 @@ def test_shared_plateaus_scatter_less_than_a_fixed_level_where_grey_drifts(balls
     assert shared < 0.85 * own
 
 
+def test_the_areas_of_the_vertices_are_those_of_the_balls(clean, balls):
+    grid, centres = balls
+    found = surface(clean)
+    v = grid.spacing[0]
+    assert found.areas.sum() == pytest.approx(len(centres) * 4 * np.pi * ((R - SIGMA**2 / R) * v) ** 2, rel=2e-3)
+    assert (found.areas > 0).all()
+
+
 def test_plateaus_are_shared_on_one_side_of_a_wall_and_not_at_its_rim():
     """Both sides of a thin wall, a grid of points each, with noisy plateaus of 1 and 5."""
     rng = np.random.default_rng(3)

@@ -12,6 +12,9 @@ L H out of C, so that with K, the sum of H over the same pairs,
 
 Interpolation between voxels makes neighbours further off differ (rho < 0), which belongs to the sum too: the window is
 never shorter than a share of the range, and grows until it holds several times the points that act as one.
+
+Points with weights w of mean 1, as for the areas that they stand for, count by them: s^2 L = 1/n sum w_i w_j C_ij, with
+w_i w_j in the sums of r_i r_j, w_i in that of r_i^2, and H of the weighted fit.
 """
 
 from __future__ import annotations
@@ -43,11 +46,14 @@ class Independence:
     dof: float
 
 
-def independence(points: Array, residuals: Array, derivatives: Array, correlation_range: float) -> Independence:
+def independence(
+    points: Array, residuals: Array, derivatives: Array, correlation_range: float, weight: Array | None = None
+) -> Independence:
     """Independence of the errors of points (n, 3), mm, with residuals (k, n) of a fit with derivatives (k, n, p).
 
     k: residuals a point has (two for a line in space).  correlation_range: mm, up to which neighbours may act as one;
-    0 takes all points as independent.
+    0 takes all points as independent.  weight: (n,) of mean 1, 1 unless given; residuals and derivatives are already
+    times its root.
     """
     if not (np.isfinite(correlation_range) and correlation_range >= 0):
         raise InputError(f"correlation_range is {correlation_range} mm; 0 or a positive length is needed")
@@ -56,10 +62,12 @@ def independence(points: Array, residuals: Array, derivatives: Array, correlatio
     total = float(np.sum(residuals**2))
     if k * n <= p:
         return Independence(variance=np.inf, n_effective=float(n), dof=0.0)
-    alone = Independence(variance=total / (k * n - p), n_effective=float(n), dof=float(k * n - p))
+    w = np.ones(n) if weight is None else weight
+    least = float(np.mean(w**2))
+    alone = Independence(variance=least * total / (k * n - p), n_effective=n / least, dof=float(k * n - p))
     if correlation_range == 0 or total == 0:
         return alone
-    count, product, taken = _sums(points, residuals, derivatives, correlation_range)
+    count, product, taken = _sums(points, residuals, derivatives, correlation_range, np.sqrt(w))
     # Cumulative over the bins of distance: neighbours a point has, sum of r_i r_j, sum of H.
     usable = np.flatnonzero(n * k - taken > LEFT * n * k)
     if not usable.size:
@@ -70,7 +78,7 @@ def independence(points: Array, residuals: Array, derivatives: Array, correlatio
     enough = usable[wide[usable] & (count[usable] >= HOLDS * acting[usable])]
     window = int(enough[0]) if enough.size else int(usable[-1])
     # A point never stands for less than itself.
-    L = float(np.clip(acting[window], 1.0, n)) if np.isfinite(acting[window]) else 1.0
+    L = float(np.clip(acting[window], least, n)) if np.isfinite(acting[window]) else least
     freedom = k * n - L * p
     if freedom <= 0:
         return Independence(variance=np.inf, n_effective=n / L, dof=0.0)
@@ -79,8 +87,11 @@ def independence(points: Array, residuals: Array, derivatives: Array, correlatio
     return Independence(variance=L * total / freedom, n_effective=n / L, dof=dof)
 
 
-def _sums(points: Array, residuals: Array, derivatives: Array, reach: float) -> tuple[Array, Array, Array]:
-    """Cumulative over BINS of distance up to reach: points within it (mean), sums of r_i r_j and of H_ij over pairs.
+def _sums(
+    points: Array, residuals: Array, derivatives: Array, reach: float, root: Array
+) -> tuple[Array, Array, Array]:
+    """Cumulative over BINS of distance up to reach: points within it (mean), sums of r_i r_j and of H_ij over pairs,
+    each times the root (n,) of both weights.
 
     Large sets are summed over every few points' neighbours, and scaled.
     """
@@ -96,7 +107,9 @@ def _sums(points: Array, residuals: Array, derivatives: Array, reach: float) -> 
     bin_of = np.minimum((h / reach * BINS).astype(np.intp), BINS - 1)
     scale = n / len(chosen)
     count = 1.0 + np.cumsum(np.bincount(bin_of, minlength=BINS)) / len(chosen)
-    product, taken = np.full(BINS, float(np.sum(residuals**2))), np.full(BINS, float(p))
+    residuals, Q = residuals * root, Q * root[:, None]
+    product = np.full(BINS, float(np.sum(residuals**2)))
+    taken = np.full(BINS, float(np.sum(Q**2)))
     for r, q in zip(residuals, Q, strict=True):
         product += scale * np.cumsum(np.bincount(bin_of, weights=r[first] * r[second], minlength=BINS))
         shared = np.einsum("ij,ij->i", q[first], q[second])

@@ -7,6 +7,8 @@ A circle in space is the two-step one: plane first, then the circle in it.
 All functions take points (n, 3), mm in any one frame, and share these options:
 
 sigma:              (n,) standard uncertainties of the points, mm; equal unless given.
+area:               (n,) of the surface that each point stands for; equal unless given.  Vertices of a mesh crowd where
+                    it passes close to a voxel's centre; weighed by areas, each piece of the surface counts alike.
 outliers:           points farther than so many rms from the fit are dropped and the fit is repeated; None keeps all.
 correlation_range:  distance up to which neighbouring points are tested for common errors, mm; 0 takes every point as
                     independent.  Vertices of a CT surface share voxels: give about 6 voxels.
@@ -64,27 +66,30 @@ Fit = Callable[[Array, Array], tuple[Array, list[Block]]]
 
 
 def fit_plane(
-    points: Any, *, sigma: Any = None, outliers: float | None = None, correlation_range: float = 0.0
+    points: Any, *, sigma: Any = None, area: Any = None, outliers: float | None = None,
+    correlation_range: float = 0.0,
 ) -> Feature:
     """Plane through the weighted centroid; the normal belongs to the least singular value.
 
     The normal's sign makes its largest component positive.
     """
-    return _fit("plane", _plane, points, sigma, outliers, correlation_range)
+    return _fit("plane", _plane, points, sigma, area, outliers, correlation_range)
 
 
 def fit_line(
-    points: Any, *, sigma: Any = None, outliers: float | None = None, correlation_range: float = 0.0
+    points: Any, *, sigma: Any = None, area: Any = None, outliers: float | None = None,
+    correlation_range: float = 0.0,
 ) -> Feature:
     """Line through the weighted centroid along the greatest singular value.  Residuals are distances, not signed."""
-    return _fit("line", _line, points, sigma, outliers, correlation_range)
+    return _fit("line", _line, points, sigma, area, outliers, correlation_range)
 
 
 def fit_circle(
-    points: Any, *, sigma: Any = None, outliers: float | None = None, correlation_range: float = 0.0
+    points: Any, *, sigma: Any = None, area: Any = None, outliers: float | None = None,
+    correlation_range: float = 0.0,
 ) -> Feature:
     """Circle in space: the plane of the points, then the circle in it.  Residuals are those in the plane."""
-    return _fit("circle", _circle, points, sigma, outliers, correlation_range)
+    return _fit("circle", _circle, points, sigma, area, outliers, correlation_range)
 
 
 def fit_sphere(
@@ -92,6 +97,7 @@ def fit_sphere(
     *,
     radius: float | None = None,
     sigma: Any = None,
+    area: Any = None,
     outliers: float | None = None,
     correlation_range: float = 0.0,
 ) -> Feature:
@@ -101,7 +107,7 @@ def fit_sphere(
     """
     if radius is not None and not (np.isfinite(radius) and radius > 0):
         raise InputError(f"the radius held is {radius} mm; a positive length is needed")
-    return _fit("sphere", lambda x, s: _sphere(x, s, radius), points, sigma, outliers, correlation_range)
+    return _fit("sphere", lambda x, s: _sphere(x, s, radius), points, sigma, area, outliers, correlation_range)
 
 
 def fit_cylinder(
@@ -109,11 +115,12 @@ def fit_cylinder(
     *,
     direction: Any = None,
     sigma: Any = None,
+    area: Any = None,
     outliers: float | None = None,
     correlation_range: float = 0.0,
 ) -> Feature:
     """Cylinder.  direction: (3,) about along the axis, where it is known; otherwise it is searched for."""
-    return _fit("cylinder", lambda x, s: _about_axis("cylinder", x, s, direction), points, sigma, outliers,
+    return _fit("cylinder", lambda x, s: _about_axis("cylinder", x, s, direction), points, sigma, area, outliers,
                 correlation_range)
 
 
@@ -122,17 +129,19 @@ def fit_cone(
     *,
     direction: Any = None,
     sigma: Any = None,
+    area: Any = None,
     outliers: float | None = None,
     correlation_range: float = 0.0,
 ) -> Feature:
     """Cone; its direction is that in which it widens.  direction: (3,) about along the axis, where it is known."""
-    return _fit("cone", lambda x, s: _about_axis("cone", x, s, direction), points, sigma, outliers, correlation_range)
+    return _fit("cone", lambda x, s: _about_axis("cone", x, s, direction), points, sigma, area, outliers,
+                correlation_range)
 
 
 # -- the common part -------------------------------------------------------------------------------------------------
 
 
-def _checked(kind: str, points: Any, sigma: Any) -> tuple[Array, Array]:
+def _checked(kind: str, points: Any, sigma: Any, area: Any) -> tuple[Array, Array, Array]:
     x = np.asarray(points, dtype=np.float64)
     if x.ndim != 2 or x.shape[1] != 3:
         raise ShapeError(f"points of a {kind} are (n, 3); got {x.shape}")
@@ -140,22 +149,26 @@ def _checked(kind: str, points: Any, sigma: Any) -> tuple[Array, Array]:
         raise InputError(f"{len(x)} points; a {kind} needs at least {LEAST_POINTS[kind]}")
     if not np.isfinite(x).all():
         raise InputError(f"{int((~np.isfinite(x)).any(axis=1).sum())} of {len(x)} points are not finite; drop them")
-    s = np.ones(len(x)) if sigma is None else np.asarray(sigma, dtype=np.float64)
-    if s.shape != (len(x),) or not (np.isfinite(s).all() and (s > 0).all()):
-        raise InputError(f"sigma needs one positive length for each of {len(x)} points; got shape {s.shape}")
-    return x, s
+    each = []
+    for name, given, what in (("sigma", sigma, "length"), ("area", area, "area")):
+        values = np.ones(len(x)) if given is None else np.asarray(given, dtype=np.float64)
+        if values.shape != (len(x),) or not (np.isfinite(values).all() and (values > 0).all()):
+            raise InputError(f"{name} needs one positive {what} for each of {len(x)} points; got shape {values.shape}")
+        each.append(values)
+    return x, each[0], each[1]
 
 
 def _fit(
-    kind: str, fit: Fit, points: Any, sigma: Any, outliers: float | None, correlation_range: float
+    kind: str, fit: Fit, points: Any, sigma: Any, area: Any, outliers: float | None, correlation_range: float
 ) -> Feature:
-    x, s = _checked(kind, points, sigma)
+    x, s, a = _checked(kind, points, sigma, area)
     if outliers is not None and not outliers > 0:
         raise InputError(f"outliers is {outliers}; a positive number of rms, or None, is needed")
     keep = np.ones(len(x), dtype=bool)
     for _ in range(MAX_OUTLIER_ROUNDS):
         used = keep
-        vector, blocks = fit(x[used], s[used])
+        w = a[used] / a[used].mean()
+        vector, blocks = fit(x[used], s[used] / np.sqrt(w))
         d = feature_distances(kind, vector, x)
         if outliers is None:
             break
@@ -165,7 +178,7 @@ def _fit(
             raise InputError(f"outlier rule {outliers:g} rms leaves {int(keep.sum())} of {len(x)} points for a {kind}")
         if np.array_equal(keep, used):
             break
-    shares = [_covariance(b, x[used], correlation_range) for b in blocks]
+    shares = [_covariance(b, x[used], w, correlation_range) for b in blocks]
     return Feature(
         kind=kind, vector=vector, covariance=sum((c for c, _ in shares), np.zeros((8, 8))), points=x, used=used,
         residuals=d, n_effective=min(i.n_effective for _, i in shares), dof=min(i.dof for _, i in shares),
@@ -173,11 +186,16 @@ def _fit(
     )
 
 
-def _covariance(block: Block, points: Array, correlation_range: float) -> tuple[Array, Independence]:
-    """(8, 8) = T s^2 L (J' W J)^-1 T', s^2 L from the residuals; infinite where no degree of freedom is left."""
+def _covariance(
+    block: Block, points: Array, weight: Array, correlation_range: float
+) -> tuple[Array, Independence]:
+    """(8, 8) = T s^2 L (J' W J)^-1 T', s^2 L from the residuals; infinite where no degree of freedom is left.
+
+    weight: (n,) of mean 1, that the block's sigma hold beside the points' own uncertainties."""
     p, n = block.J.shape[1], len(points)
     J = block.J / block.sigma[:, None]
-    found = independence(points, (block.d / block.sigma).reshape(-1, n), J.reshape(-1, n, p), correlation_range)
+    d = (block.d / block.sigma).reshape(-1, n)
+    found = independence(points, d, J.reshape(-1, n, p), correlation_range, weight)
     covariance = block.T @ np.linalg.pinv(J.T @ J, hermitian=True) @ block.T.T
     return np.multiply(covariance, found.variance, out=np.zeros((8, 8)), where=covariance != 0), found
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -176,8 +177,8 @@ class _Bench:
 
     def _feature(self, name: str, plan: FeaturePlan, alignment: Alignment) -> Feature:
         try:
-            points, normals, sigma = self._points(plan, alignment)
-            feature = self._fitted(plan, alignment, points)
+            points, normals, sigma, area = self._points(plan, alignment)
+            feature = self._fitted(plan, alignment, points, area)
         except InputError as error:
             raise InputError(f"feature {name!r}: {error}") from error
         if plan.kind == "plane" and feature.direction @ normals.mean(axis=0) < 0:
@@ -186,8 +187,8 @@ class _Bench:
             feature = _curvature_corrected(feature, sigma)
         return replace(feature, kind=plan.kind)
 
-    def _points(self, plan: FeaturePlan, alignment: Alignment) -> tuple[Array, Array, float]:
-        """Measured points (n, 3) of a feature, their normals, and the blur, mm."""
+    def _points(self, plan: FeaturePlan, alignment: Alignment) -> tuple[Array, Array, float, Array | None]:
+        """Measured points (n, 3) of a feature, their normals, the blur, mm, and the areas of a surface's points."""
         if plan.source == "surface":
             s = self.surface()
             region = surface_region(plan, alignment, s.points, s.normals)
@@ -198,7 +199,7 @@ class _Bench:
                     f"its region holds no surface points{without if region.any() else ''}; check point, band_mm, "
                     "safety_mm and the alignment against the volume"
                 )
-            return s.points[chosen], s.normals[chosen], s.sigma
+            return s.points[chosen], s.normals[chosen], s.sigma, s.areas[chosen]
         x, n = nominal_pattern(plan, alignment)
         # Shared plateaus make points quieter, not lengths, and errors common to a whole small feature do not show in
         # its residuals: each point keeps its own.
@@ -207,19 +208,19 @@ class _Bench:
         lost = int((~found.good).sum())
         if lost:
             self.notes.append(f"{lost} of {len(x)} probed points of a {plan.kind} met no good edge")
-        return found.points[found.good], found.normals[found.good], found.edges.sigma
+        return found.points[found.good], found.normals[found.good], found.edges.sigma, None
 
-    def _fitted(self, plan: FeaturePlan, alignment: Alignment, points: Array) -> Feature:
-        reach = CORRELATION_VOXELS * float(self.volume.grid.spacing.max())
-        outliers = plan.outliers
+    def _fitted(self, plan: FeaturePlan, alignment: Alignment, points: Array, area: Array | None) -> Feature:
+        options: dict[str, Any] = {"area": area, "outliers": plan.outliers,
+                                   "correlation_range": CORRELATION_VOXELS * float(self.volume.grid.spacing.max())}
         simple = {"plane": fit_plane, "line": fit_line, "circle": fit_circle}
         if plan.kind in simple:
-            return simple[plan.kind](points, outliers=outliers, correlation_range=reach)
+            return simple[plan.kind](points, **options)
         if plan.kind in ("sphere", "calotte"):
             held = plan.radius_mm if plan.fixed_radius else None
-            return fit_sphere(points, radius=held, outliers=outliers, correlation_range=reach)
+            return fit_sphere(points, radius=held, **options)
         fit = fit_cylinder if plan.kind == "cylinder" else fit_cone
-        return fit(points, direction=alignment.directions(plan.direction), outliers=outliers, correlation_range=reach)
+        return fit(points, direction=alignment.directions(plan.direction), **options)
 
     def spheres(self) -> tuple[dict[str, Feature], float]:
         """The multi-sphere standard: its spheres by name, and the factor on its lengths."""

@@ -2,7 +2,8 @@
 
 A step fitted with its plateaus free pays for their noise: over a window of 4 sigma on both sides the place scatters a
 third more than with known plateaus.  Drift of grey values (beam hardening, scatter, cupping) is slow over some voxels,
-so the median of neighbouring edges' plateaus is local enough and far quieter.  Next to an edge of the part, where
+so the trimmed mean of neighbouring edges' plateaus is local enough and far quieter (a median would be noisier than a
+mean by a quarter, and centres with it; a tenth trimmed off at both ends costs 3 %).  Next to an edge of the part, where
 plateaus fall within a voxel or two, an edge keeps its own and lends them to none: its neighbours lie on one side.
 With plateaus a', b' in place of a, b, the normal equations of the fit move the place by
 
@@ -22,6 +23,8 @@ ONE_SIDED = 0.15
 """Distance of the neighbours' centroid, as a share of the radius, from which they lie on one side."""
 UNLIKE = 4.0
 """An edge whose plateau differs from its neighbours' by so many times the usual difference keeps its own."""
+TRIMMED = 0.1
+"""Share of the neighbours' plateaus that is left out at each end."""
 MOST = 400
 """Neighbours looked at; a radius of 3 voxels holds about 60."""
 SAME_SIDE = 0.7
@@ -40,13 +43,13 @@ def shared_plateaus(points: Array, normals: Array, own: Array, radius: float) ->
     order = np.argsort(key, kind="stable")
     x, n, values, key = points[order], normals[order], own[order], key[order]
     inner = _inner(x, n, key, size, radius)
-    median, count = _medians(x, n, values, key, size, radius, inner)
-    unlike = np.abs(median - values)
+    shared, count = _trimmed_means(x, n, values, key, size, radius, inner)
+    unlike = np.abs(shared - values)
     usual = 1.4826 * np.median(unlike[inner], axis=0) if inner.any() else np.zeros(2)
     kept = ~inner | (unlike > UNLIKE * usual).any(axis=1)
-    median[kept], count[kept] = values[kept], 1.0
+    shared[kept], count[kept] = values[kept], 1.0
     back = np.argsort(order)
-    return median[back], count[back]
+    return shared[back], count[back]
 
 
 @njit(cache=True)
@@ -92,10 +95,10 @@ def _inner(x: Any, n: Any, key: Any, size: Any, radius: Any) -> Any:
 
 
 @njit(cache=True, parallel=True)
-def _medians(x: Any, n: Any, values: Any, key: Any, size: Any, radius: Any, lends: Any) -> Any:
-    """Medians (n, c) of values (n, c) over the neighbours that lend, itself included, and their number (n,)."""
+def _trimmed_means(x: Any, n: Any, values: Any, key: Any, size: Any, radius: Any, lends: Any) -> Any:
+    """Trimmed means (n, c) of values (n, c) over the neighbours that lend, itself included, and their number (n,)."""
     m, c = values.shape
-    median, count = np.empty((m, c)), np.empty(m)
+    mean, count = np.empty((m, c)), np.empty(m)
     for i in prange(m):
         near, found = np.empty((c, MOST)), 1
         for a in range(c):
@@ -110,7 +113,8 @@ def _medians(x: Any, n: Any, values: Any, key: Any, size: Any, radius: Any, lend
                             near[a, found] = values[k, a]
                         found += 1
                     k += 1
+        cut = int(TRIMMED * found)
         for a in range(c):
-            median[i, a] = np.median(near[a, :found])
+            mean[i, a] = np.mean(np.sort(near[a, :found])[cut: found - cut])
         count[i] = found
-    return median, count
+    return mean, count

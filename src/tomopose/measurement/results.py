@@ -87,7 +87,7 @@ class MeasurementResult:
 class Repeat:
     """A measurand over a group of repeats: mean, standard deviation s, expanded uncertainty after VDI/VDE 2630-2.1:
 
-    U = k sqrt(u_cal^2 + s^2 + u_fit^2) + |b|, k = 2, b the mean error, where a reference is given.
+    U = k sqrt(u_cal^2 + s^2) + |b|, k = 2, b the mean error, where a reference is given; `interval` says what U holds.
     """
 
     group: str
@@ -98,6 +98,7 @@ class Repeat:
     unit: str
     error: float | None
     U: float
+    interval: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,5 +215,6 @@ def _repeat(group: str, name: str, rows: list[MeasurementResult]) -> Repeat:
     error = None if reference is None else float(values.mean()) - reference
     # The spread of repeats holds the fit's noise already; the larger of the two stands for both.
     U = 2.0 * math.sqrt(rows[0].u_reference**2 + max(s, u_fit) ** 2) + (0.0 if error is None else abs(error))
+    systematic = "without the systematic part" if error is None else "mean error from the reference"
     return Repeat(group=group, name=name, n=len(rows), mean=float(values.mean()), s=s, unit=rows[0].unit, error=error,
-                  U=U)
+                  U=U, interval=f"repeats; {systematic}")

@@ -189,7 +189,8 @@ def measure_sphere(
                 "safety distance smaller or the angle larger"
             )
         fit = fit_sphere(
-            surface.points[kept], outliers=outliers, correlation_range=CORRELATION_VOXELS * float(surface.spacing.max())
+            surface.points[kept], area=surface.areas[kept], outliers=outliers,
+            correlation_range=CORRELATION_VOXELS * float(surface.spacing.max()),
         )
         rough = fit.point
     return fit

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -33,6 +34,7 @@ SurfaceMethod = Literal["esf", "local-50", "iso-50"]
 NORMAL_SIGMA, CURVATURE_SIGMA = 1.0, 1.5
 """Smoothing for normals and for curvatures, voxels."""
 LAYERS = 128
+LEAST_AREA = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,6 +76,15 @@ class Surface:
     def good(self) -> np.ndarray:
         """(n,) True where the edge was measured."""
         return np.asarray(self.flags == 0)
+
+    @cached_property
+    def areas(self) -> Array:
+        """(n,) mm^2: a third of the triangles about each vertex; weights for fits.  Never below a thousandth of the
+        mean, so that vertices of triangles without area count for nothing but can be fitted."""
+        a, b, c = (self.points[self.faces[:, k]] for k in range(3))
+        third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+        area = np.bincount(self.faces.ravel(), np.repeat(third, 3), minlength=len(self))
+        return np.maximum(area, LEAST_AREA * area.mean())
 
 
 def surface(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tomopose.geometry.rotations import log_rotation
-from tomopose.measurement.budget import Budget
+from tomopose.measurement.budget import FIT_ALONE, Budget
 from tomopose.measurement.comparison import Comparison
 from tomopose.measurement.results import MeasurementResult, MeasurementResults
 from tomopose.report.deviation_picture import vik_scale
@@ -225,8 +225,12 @@ def _rows(results: MeasurementResults) -> Table:
         return [r.volume, r.name, *shown, kept, r.direction, r.method]
 
     return Table(
-        title="Rows", meaning="U: half width of the 95 % interval from the scatter of the fitted points.",
-        columns=["volume", "name", "value", "U / µm", "error / µm", "limit / µm", "within", "direction", "method"],
+        title="Rows",
+        meaning="U: half width of the 95 % interval from the scatter of the fitted points. It is not the whole "
+        "uncertainty: what all scans have in common (attenuation that is not linear, artefacts, the calibration) is "
+        "not in it.",
+        columns=["volume", "name", "value", f"U / µm ({FIT_ALONE})", "error / µm", "limit / µm", "within", "direction",
+                 "method"],
         rows=[cells(r) for r in results.results], numeric=(2, 3, 4, 5), folded=len(results) > MANY,
     )
 
@@ -238,9 +242,10 @@ def _repeats(results: MeasurementResults) -> list[Block]:
     return [Table(
         title="Repeats",
         meaning="Groups of volumes that repeat one measurement: U = 2 √(u_cal² + s²) + |mean error|.",
-        columns=["group", "name", "n", "mean / mm", "s / µm", "mean error / µm", "U / µm"], numeric=(2, 3, 4, 5, 6),
+        columns=["group", "name", "n", "mean / mm", "s / µm", "mean error / µm", "U / µm", "holds"],
+        numeric=(2, 3, 4, 5, 6),
         rows=[[r.group, r.name, str(r.n), f"{r.mean:.5f}", _um(r.s), "–" if r.error is None else _um(r.error, True),
-               _um(r.U)] for r in found],
+               _um(r.U), r.interval] for r in found],
         folded=len(found) > MANY,
     )]
 
@@ -254,18 +259,20 @@ def _budgets(results: MeasurementResults) -> list[Section]:
     def cells(b: Budget) -> list[str]:
         shares = ["–" if u is None or not math.isfinite(u) else _um(u) for u in
                   (b.fit, b.repeats, b.calibration, b.simulation)]
-        return [b.volume, b.name, *shares, "–" if b.mean_error is None else _um(b.mean_error, True),
-                f"{b.corrected:.5f}", _um(b.U) if math.isfinite(b.U) else "–"]
+        corrected = ["–", "–"] if b.mean_error is None else [_um(b.mean_error, True), f"{b.corrected:.5f}"]
+        return [b.volume, b.name, f"{b.value:.5f}", *shares, *corrected, _um(b.U) if math.isfinite(b.U) else "–",
+                b.interval]
 
     return [Section(
         title="Uncertainty", lead="Standard uncertainties, each by itself, and the 95 % interval of all together.",
         blocks=[Table(
             title="Shares",
             meaning="Fit and repeats show the same scatter, the larger counts; the calibration's share is added in "
-            "squares. Virtual scans hold both: the larger result counts, and their mean error is taken off the value.",
-            columns=["volume", "name", "fit / µm", "repeats / µm", "calibration / µm", "simulation / µm",
-                     "its mean error / µm", "corrected / mm", "U / µm"],
-            numeric=tuple(range(2, 9)), rows=[cells(b) for b in found], folded=len(found) > MANY,
+            "squares. Virtual scans hold noise and systematic part, and stand for all: their mean error is taken off "
+            "the value, and U is that of one more scan like them.",
+            columns=["volume", "name", "measured / mm", "fit / µm", "repeats / µm", "calibration / µm",
+                     "simulation / µm", "its mean error / µm", "corrected by simulation / mm", "U / µm", "holds"],
+            numeric=tuple(range(2, 10)), rows=[cells(b) for b in found], folded=len(found) > MANY,
         )],
     )]
 
