@@ -190,6 +190,41 @@ def test_one_more_number_a_view(gantry, scanner, rng):
     assert own > 0.05, f"half a millimetre of d_SD moves points {r:.0f} px from the middle"
 
 
+def test_a_c_arm_with_a_lift(gantry, scanner, rng, capsys):
+    """A C-arm of one sliding and two turning joints, by joint values alone."""
+    from tomopose.studies.improvements import c_arm
+
+    folder, arm = gantry[0], c_arm()
+    p = rng.standard_normal(len(arm.names)) * arm.sigma
+    q = np.column_stack([rng.uniform(-20, 20, 100), *np.radians(rng.uniform(-1, 1, (2, 100)) * [[45], [100]])])
+    mount = tp.RigidTransform.from_angles([0.02, -0.03, 1.6], [1.0, -2.0, 1.5], source=tp.Frame.H, target=tp.Frame.T)
+    balls = np.array([[20.0, -15.0, 12.0], [-18.0, 15.0, -15.0]])
+    table = poses_from_joints(arm, q, ball_id=np.arange(100) % 2)
+    turn = np.radians(np.linspace(-90, 90, 20))
+    scan = poses_from_joints(arm, np.column_stack([np.zeros(20), np.radians(8) * np.sin(5 * turn), turn]))
+    real = tp.inverse_poses(real_motion(arm, table, p, disturbance=Disturbance(), rng=rng))
+    x = project_ball(scanner, T_HT=mount, T_MH=real.T_MH, t=balls[np.asarray(table.ball_id)])
+    x = x + SIGMA * rng.standard_normal(x.shape)
+    for name, one in (("poses", table), ("scan", scan)):
+        (folder / f"{name}.csv").unlink()
+        tp.write_poses(folder / f"{name}.csv", one, joint_units=arm.joint_units)
+        assert "q1_mm,q2_deg,q3_deg" in (folder / f"{name}.csv").read_text()
+    seen = tp.BallObservations.from_sigma(x, SIGMA, pose_id=table.pose_id)
+    tp.write_observations(folder / "o.csv", seen, force=True)
+    write_manipulator(folder / "robot.json", arm)
+    length = float(np.linalg.norm(balls[0] - balls[1]))
+    more = ("--manipulator", folder / "robot.json", "--distance", f"0,1={length:.5f}(0.0005)", "--model", "kinematic")
+    assert calibrate(folder, "cal", "--arrangement", "moving-scanner", *more) == 0
+    assert matrices(folder, "cal", "--commands", folder / "c.csv") == 1
+    assert "a machine of 3 joints cannot be commanded to correct all six" in capsys.readouterr().err
+    assert not (folder / "cal.npz").exists()
+    assert matrices(folder, "cal") == 0
+    home = tp.inverse_poses(real_motion(arm, scan, p))
+    truth = eq5_matrices(scanner, T_HT=mount, T_MH=home.T_MH, alpha=home.alpha)
+    error = rms_px(without_object_pose(tp.read_matrices(folder / "cal.npz").P, truth, CORNERS))
+    assert error < 0.15
+
+
 def test_options_that_contradict_one_another(gantry, capsys):
     folder = gantry[0]
     for more, told in (

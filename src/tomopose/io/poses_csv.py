@@ -315,11 +315,12 @@ def _warn_if_far(table: TextTable, measured: RigidTransform, commanded: RigidTra
 
 def write_poses(
     path: str | Path, poses: PoseSequence, *, convention: str | None = None, comments: Iterable[tuple[str, str]] = (),
-    force: bool = False,
+    joint_units: Sequence[str] = (), force: bool = False,
 ) -> None:
     """Write poses.csv in a named convention (default: the one the poses came in), floats with all their digits.
 
-    comments: further `# key: value` lines.  FileError if the file exists and `force` is not given.
+    comments: further `# key: value` lines.  joint_units: "deg" or "mm" of each column of joint values; default "deg".
+    FileError if the file exists and `force` is not given.
     """
     path = require_absent(path, force=force)
     c = convention_named(convention or poses.convention)
@@ -337,7 +338,11 @@ def write_poses(
     if poses.T_MH_set is not None:
         columns |= _columns(poses.T_MH_set, c, commanded=True)
     if poses.q is not None:
-        columns |= {f"q{k + 1}_deg": np.degrees(q).tolist() for k, q in enumerate(poses.q.T)}
+        units = tuple(joint_units) or ("deg",) * poses.q.shape[1]
+        columns |= {
+            f"q{k + 1}_{unit}": (np.degrees(q) if unit == "deg" else q).tolist()
+            for k, (q, unit) in enumerate(zip(poses.q.T, units, strict=True))
+        }
     head = {"convention": c.name, "source": poses.source}
     if poses.pivot is not None:
         head["pivot_mm"] = ", ".join(repr(float(x)) for x in poses.pivot)

@@ -190,6 +190,11 @@ def commands_for(manipulator: Mapping[str, Any], wanted: PoseSequence) -> PoseSe
     command = replace(wanted, q=None)
     extra = None
     if isinstance(model, SerialRobot):
+        if len(model.joints) < 6:
+            raise InputError(
+                f"a machine of {len(model.joints)} joints cannot be commanded to correct all six coordinates of a "
+                "pose; its matrices hold where it really goes"
+            )
         q, extra = model.joint_values(wanted)
         command = replace(wanted, q=q)
     for _ in range(COMMAND_STEPS):

@@ -127,6 +127,11 @@ class SerialRobot:
         """(len(p),) mm: the nominal length that each error changes; 0 where it changes an angle."""
         return np.array([getattr(self.joints[k], name) if name in ("a", "d") else 0.0 for k, name, _ in self._errors])
 
+    @property
+    def joint_units(self) -> tuple[str, ...]:
+        """Of each joint's values in a table: deg or mm."""
+        return tuple("deg" if j.kind == "turning" else "mm" for j in self.joints)
+
     # -- kinematics --------------------------------------------------------------------------------------------------
 
     def chain(self, q: Array, p: Array | None = None) -> tuple[Array, Array, Array]:
