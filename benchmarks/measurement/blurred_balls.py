@@ -18,6 +18,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "measurement"))
 from blurred_shapes import as_volume, balls_on_a_lattice, balls_volume
 
+from tomopose.measurement.edge_search import EdgeSettings
 from tomopose.measurement.fits import fit_sphere
 from tomopose.measurement.histogram import grey_levels
 from tomopose.measurement.surface import surface
@@ -49,7 +50,7 @@ def vertex_areas(points, faces):
     return np.maximum(area, 1e-3 * area.mean())
 
 
-def rows(volume, centres, radius):
+def rows(volume, centres, radius, window):
     from scipy.spatial import cKDTree
 
     def fitted(points, area):
@@ -75,17 +76,19 @@ def rows(volume, centres, radius):
     vtk = surface(volume, method="iso-50")
     yield "VTK ISO-50", fitted(vtk.points, vtk.areas)
     for method, correct in (("local-50", False), ("esf", False), ("esf", True)):
-        found = surface(volume, method=method, curvature_correction=correct)
+        found = surface(volume, method=method, edges=EdgeSettings(window=window), curvature_correction=correct)
         yield f"{method}{' corrected' if correct else ''}", fitted(found.points[found.good], found.areas[found.good])
 
 
-def bound(radius):
-    """Cramer-Rao bound of a centre, rms in 3-D, voxels: white noise in all voxels about the rim, all else known.
+def bound(radius, window=np.inf):
+    """Cramer-Rao bound of a centre, rms in 3-D, voxels: white noise in all voxels within `window` of the rim.
 
     The grey of a blurred ball of contrast 1 falls as a Gaussian of SIGMA along the radius, so that each coordinate's
-    information is 4 pi R^2 / 3 times the integral of that squared, over the noise squared.
+    information is 4 pi R^2 / 3 times the integral of that squared, over the noise squared.  Where the levels on both
+    sides are known from voxels within the window alone, and as the place vary about the ball, the level midway takes
+    (integral of the Gaussian)^2 / (2 window) of it.
     """
-    information = 4 * np.pi * radius**2 / 3 / (2 * np.sqrt(np.pi) * SIGMA) / NOISE**2
+    information = 4 * np.pi * radius**2 / 3 * (1 / (2 * np.sqrt(np.pi) * SIGMA) - 1 / (2 * window)) / NOISE**2
     return np.sqrt(3 / information)
 
 
@@ -113,18 +116,21 @@ def main():
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--radius", type=float, default=16.9)
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--window", type=float)
     parser.add_argument("--time", type=int)
     args = parser.parse_args()
     if args.time:
         time_large(args.time, 1)
         return
-    print(f"bound of a centre from all voxels, CNR 20, levels known: {bound(args.radius):.5f}")
+    window = 2.5 * SIGMA + 1.5 if args.window is None else args.window
+    print(f"bound of a centre, CNR 20: {bound(args.radius):.5f} with known levels, {bound(args.radius, window):.5f} with "
+          f"levels from the {window:g} voxels on both sides")
     print("voxels: centre rms (3-D), radius bias, radius sd, residual rms, full range, D95, 25 patches")
     table = {}
     for seed in range(1, args.seeds + 1):
         grid, centres, volumes = scene(args.size, seed, args.radius)
         for case, values in volumes.items():
-            for name, numbers in rows(as_volume(values, grid), centres, args.radius):
+            for name, numbers in rows(as_volume(values, grid), centres, args.radius, args.window):
                 table.setdefault((case, name), []).append(numbers)
                 print(f"{case:8s} {name:22s}" + "".join(f"{x:10.5f}" for x in numbers), flush=True)
     if args.seeds > 1:

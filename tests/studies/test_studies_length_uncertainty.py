@@ -16,6 +16,7 @@ from tomopose.manipulator.error_models import manipulator_block
 from tomopose.manipulator.pose_map import PoseMap
 from tomopose.measurement.alignment import Alignment
 from tomopose.measurement.fits import fit_plane, fit_sphere
+from tomopose.measurement.measure import measure
 from tomopose.measurement.plan import plan_from
 from tomopose.measurement.probing import plane_pattern, sphere_pattern
 from tomopose.measurement.results import MeasurementResults
@@ -160,14 +161,18 @@ def test_a_scene_whose_manipulator_errs_is_believed_to_stand_where_the_calibrati
     assert np.abs(ignored - ideal).max() > 0.3 * ideal.max()
 
 
-def test_draws_lie_elsewhere_in_voxels_of_other_sizes(run):
-    """Relative places of the two ends of a length within their voxels are drawn too."""
+def test_draws_lie_elsewhere_and_differ_in_size_by_voxels(run):
+    """Relative places of the two ends of a length within their voxels are drawn too; lengths in mm stay."""
     grid = tp.VoxelGrid.cube(n=SIZE, spacing=VOXEL)
-    grids = [v.grid for v in virtual_volumes(run, grid, draws=4)]
-    sizes = np.array([g.spacing[0] for g in grids]) / VOXEL
-    assert (np.abs(sizes - 1) <= 0.02).all()
-    assert np.ptp(sizes) > 0.005
-    assert all(np.all(np.abs(g.centre - grid.centre) <= VOXEL / 2) for g in grids)
+    volumes = list(virtual_volumes(run, grid, draws=6))
+    sizes = VOXEL / np.array([v.grid.spacing[0] for v in volumes])
+    assert np.abs(sizes - 1).max() == pytest.approx(0.8 * 0.02, rel=0.2)
+    assert sizes.mean() == pytest.approx(1.0, abs=1e-3)
+    assert len(np.unique(sizes)) == 5
+    for v, size in zip(volumes, sizes, strict=True):
+        assert np.all(np.abs(v.grid.centre * size - grid.centre) <= VOXEL / 2)
+        (length,) = (r.value for r in measure(v, plan()).results if r.name == "SD")
+        assert length == pytest.approx(float(np.linalg.norm(BALLS[1] - BALLS[0])), abs=0.02 * VOXEL)
 
 
 def test_virtual_scans_scatter_by_noise_and_repeat():

@@ -1,10 +1,12 @@
 """The uncertainty of measurands by simulation with the virtual CT (JCGM 101:2008).
 
 Each draw is a whole scan of the nominal object: photon noise of its own, matrices from a calibration drawn from its
-covariance, reconstruction on a grid of its own, and measurement by the plan.  Nobody knows where within their voxels
-the two ends of a length lie.  The grid is therefore shifted by up to half a voxel, and its voxels are made up to 2 %
-larger or smaller: over 25 voxels that moves one end by half a voxel against the other, as another size of the part
-would.  The noiseless images are made once: nothing of this changes them.
+covariance, reconstruction on a grid shifted by up to half a voxel, and measurement by the plan.
+
+Nobody knows where within their voxels and pixels the two ends of a length lie against each other.  The draws therefore
+fall into SIZES groups, for which the object is between 2 % smaller and 2 % larger in voxels and pixels: over 25 voxels
+that moves one end through a whole voxel against the other.  It is the scanner with its voxels that is made larger or
+smaller, so that the plan and its nominal values stay.  The noiseless images are made once for each group.
 """
 
 from __future__ import annotations
@@ -38,8 +40,8 @@ from tomopose.units import Array
 from tomopose.volume import Volume, VoxelGrid
 
 LEAST_DRAWS = 3
-VOXEL_SPREAD = 0.02
-"""Share by which the voxels of a draw are larger or smaller at most."""
+SIZES, SIZE_SPREAD = 5, 0.02
+"""Sizes of the object in voxels over which the draws are shared out, and by which share they differ at most."""
 POSE_STEPS = 4
 
 
@@ -88,19 +90,39 @@ def virtual_volumes(
     run: SimulatedRun, grid: VoxelGrid, *, draws: int, calibration: Calibration | None = None, seed: int = 0,
     options: Mapping[str, Any] | None = None,
 ) -> Iterator[Volume]:
-    """Reconstructions of the run, each with noise, believed matrices and grid of its own; draw k is always the same."""
-    clean = [signal(run, i).astype(np.float32) for i in range(len(run))]
-    for k in range(draws):
-        sequence = np.random.SeedSequence([seed, k])
-        noise, rng = int(sequence.generate_state(1)[0]), np.random.default_rng(sequence)
-        matrices = drawn_matrices(run, grid, calibration, rng)
-        shifted = replace(grid, centre=grid.centre + grid.spacing * rng.uniform(-0.5, 0.5, 3),
-                          spacing=grid.spacing * (1 + VOXEL_SPREAD * rng.uniform(-1, 1)))
-        images = [expose(T.astype(np.float64), run.detector, run.scanner, seed=noise, frame=i)
-                  for i, T in enumerate(clean)]
-        white, dark = _levels(run, noise)
-        yield reconstruct(images, matrices, shifted, images_are="counts", white=white, dark=dark, consistency="off",
-                          **dict(options or {}))
+    """Reconstructions of the run, each with noise, believed matrices and grid of its own; draw k of as many draws is
+    always the same."""
+    for group in np.array_split(np.arange(draws), min(SIZES, draws)):
+        size = 1 + SIZE_SPREAD * ((group.mean() + 0.5) / draws * 2 - 1)
+        scaled = _scaled(run, size)
+        clean = [signal(scaled, i).astype(np.float32) for i in range(len(run))]
+        for k in group:
+            sequence = np.random.SeedSequence([seed, int(k)])
+            noise, rng = int(sequence.generate_state(1)[0]), np.random.default_rng(sequence)
+            found = drawn_matrices(run, grid, calibration, rng)
+            # What the scanner saw at size times x it sees at x, being so much smaller.
+            matrices = replace(found, P=found.P * [size, size, size, 1.0], p_u=found.p_u / size, p_v=found.p_v / size,
+                               scanner=None if found.scanner is None else _smaller(found.scanner, size))
+            box = replace(grid, centre=(grid.centre + grid.spacing * rng.uniform(-0.5, 0.5, 3)) / size,
+                          spacing=grid.spacing / size)
+            images = [expose(T.astype(np.float64), run.detector, run.scanner, seed=noise, frame=i)
+                      for i, T in enumerate(clean)]
+            white, dark = _levels(run, noise)
+            yield reconstruct(images, matrices, box, images_are="counts", white=white, dark=dark, consistency="off",
+                              **dict(options or {}))
+
+
+def _scaled(run: SimulatedRun, size: float) -> SimulatedRun:
+    """The run on a scanner smaller by `size`, on which the same object is larger by that in pixels."""
+    def smaller(T: RigidTransform) -> RigidTransform:
+        return replace(T, t=T.t / size)
+
+    return replace(run, scanner=_smaller(run.scanner, size), T_HT=smaller(run.T_HT), T_MH=smaller(run.T_MH),
+                   poses=replace(run.poses, T_MH=smaller(run.poses.T_MH)))
+
+
+def _smaller(scanner: Scanner, size: float) -> Scanner:
+    return replace(scanner, **{name: getattr(scanner, name) / size for name in ("d_SD", "d_SR", "p_u", "p_v", "axis_y")})
 
 
 def _levels(run: SimulatedRun, seed: int) -> tuple[Any, Any]:
