@@ -7,10 +7,12 @@ import math
 import numpy as np
 from numba import njit
 
-from tomopose.units import Array
+from tomopose.detection.order import select
 
-MOST = 10
-"""Centres of a level that are looked at, those with most votes."""
+MOST, PEAKS = 10, 3
+"""Centres of a level that are looked at, those with most votes, and how many of them a band and polarity can give."""
+LEAST_VOTES = 0.3
+"""Share of a circle's rim that must point to its centre."""
 SMALLEST, LARGEST = 3.4, 14.5
 """Radii, in px of a level, that are looked for on it; levels follow by factors of 2."""
 BANDS = ((3.4, 5.6), (5.6, 9.0), (9.0, 14.5))
@@ -50,10 +52,10 @@ def _gradient_square(image):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _votes(image, square, threshold, bands):  # type: ignore[no-untyped-def]
+def _votes(image, square, threshold):  # type: ignore[no-untyped-def]
     """(polarity, band, rows, columns): 1 for a full circle about that centre; polarity 0 is dark inside."""
     rows, columns = image.shape
-    out = np.zeros((2, bands.shape[0], rows, columns), np.float32)
+    out = np.zeros((2, len(BANDS), rows, columns), np.float32)
     for j in range(1, rows - 1):
         for i in range(1, columns - 1):
             here = square[j, i]
@@ -66,9 +68,8 @@ def _votes(image, square, threshold, bands):  # type: ignore[no-untyped-def]
             du, dv = round(gu), round(gv)
             if square[j + dv, i + du] > here or square[j - dv, i - du] >= here:
                 continue
-            for band in range(bands.shape[0]):
-                low, high = math.ceil(bands[band, 0]), int(bands[band, 1])
-                for radius in range(low, high + 1):
+            for band in range(len(BANDS)):
+                for radius in range(math.ceil(BANDS[band][0]), int(BANDS[band][1]) + 1):
                     weight = 1.0 / (2.0 * math.pi * radius)
                     for side in range(2):
                         sign = -1.0 if side == 0 else 1.0
@@ -79,61 +80,73 @@ def _votes(image, square, threshold, bands):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _peaks(votes, reach, least, most):  # type: ignore[no-untyped-def]
-    """(n, 3): u, v, votes of the highest local maxima of votes summed over (2 reach + 1)^2 pixels."""
+def _peaks(votes, reach):  # type: ignore[no-untyped-def]
+    """((n, 3), n): u, v, votes of the highest local maxima of votes summed over (2 reach + 1)^2 pixels."""
     rows, columns = votes.shape
     total = np.zeros((rows, columns), np.float32)
-    line = np.zeros((rows, columns), np.float32)
     for j in range(rows):
         for i in range(columns):
             if votes[j, i] != 0.0:
-                for x in range(max(0, i - reach), min(columns, i + reach + 1)):
-                    line[j, x] += votes[j, i]
-    for j in range(rows):
-        for i in range(columns):
-            if line[j, i] != 0.0:
                 for y in range(max(0, j - reach), min(rows, j + reach + 1)):
-                    total[y, i] += line[j, i]
-    out = np.zeros((most, 3))
-    size = 0
+                    for x in range(max(0, i - reach), min(columns, i + reach + 1)):
+                        total[y, x] += votes[j, i]
+    out = np.zeros((PEAKS, 3))
+    n = 0
     for j in range(rows):
         for i in range(columns):
             here = total[j, i]
-            if here < least or (size == most and here <= out[size - 1, 2]):
-                continue
-            highest = True
-            for y in range(max(0, j - 2), min(rows, j + 3)):
-                for x in range(max(0, i - 2), min(columns, i + 3)):
-                    if total[y, x] > here or (total[y, x] == here and (y < j or (y == j and x < i))):
-                        highest = False
-            if not highest:
-                continue
-            place = min(size, most - 1)
-            while place > 0 and out[place - 1, 2] < here:
-                out[place] = out[place - 1]
-                place -= 1
-            out[place, 0], out[place, 1], out[place, 2] = i, j, here
-            size = min(size + 1, most)
-    return out[:size]
+            if here >= LEAST_VOTES and (n < PEAKS or here > out[n - 1, 2]) and _is_highest(total, i, j):
+                n = _ranked(out, n, np.array([i, j, here]))
+    return out, n
 
 
-def circle_centres(level: Array, most: int = 3) -> tuple[float, list[tuple[float, float, float, float, int]]]:
-    """Noise of a pixel, and (u, v, low radius, high radius, polarity) of places that edges point to or away from."""
+@njit(cache=True)
+def _is_highest(total, i, j):  # type: ignore[no-untyped-def]
+    """Whether no pixel within 2 px is higher; of equal ones the first counts."""
+    here = total[j, i]
+    for y in range(max(0, j - 2), min(total.shape[0], j + 3)):
+        for x in range(max(0, i - 2), min(total.shape[1], i + 3)):
+            if total[y, x] > here or (total[y, x] == here and (y < j or (y == j and x < i))):
+                return False
+    return True
+
+
+@njit(cache=True)
+def circle_centres(level):  # type: ignore[no-untyped-def]
+    """(noise of a pixel, (n, 5)): u, v, band, polarity, votes of places that edges point to or away from, most first.
+
+    level: float32.  The polarity is 0 for an inside darker than its surroundings, 1 for a brighter one.
+    """
+    found = np.zeros((MOST, 5))
     if min(level.shape) < 9:
-        return 0.0, []
+        return 0.0, found[:0]
     square = _gradient_square(level)
-    sample = square[1:-1:3, 1:-1:3]
     # For normal noise |grad|^2 is exponential with mean 2 s^2: its lower quartile is 0.575 s^2, whatever the edges, and
     # s^2 = 2 sigma^2 for the difference of two pixels.
-    noise = float(np.quantile(sample, 0.25)) / 0.575 / 2
-    top = float(square.max())
-    threshold = max(36.0 * noise, 2e-5 * top)
-    if not top > threshold:
-        return math.sqrt(noise), []
-    votes = _votes(level, square, np.float32(threshold), np.array(BANDS))
-    found: list[tuple[float, float, float, float, float, int]] = []
-    for polarity in range(2):
-        for band, (low, high) in enumerate(BANDS):
-            for u, v, count in _peaks(votes[polarity, band], 1 if band == 0 else 2, 0.3, most):
-                found.append((-float(count), float(u), float(v), low, high, polarity))
-    return math.sqrt(noise), [f[1:] for f in sorted(found)[:MOST]]
+    sample = square[1:-1:3, 1:-1:3].copy().ravel()
+    noise = select(sample, sample.shape[0], sample.shape[0] // 4) / 0.575 / 2
+    top = np.max(square)
+    threshold = np.float32(max(36.0 * noise, 2e-5 * top))
+    n = 0
+    if top > threshold:
+        votes = _votes(level, square, threshold)
+        for polarity in range(2):
+            for band in range(len(BANDS)):
+                peaks, size = _peaks(votes[polarity, band], 1 if band == 0 else 2)
+                for k in range(size):
+                    row = np.array([peaks[k, 0], peaks[k, 1], band, polarity, peaks[k, 2]])
+                    n = _ranked(found, n, row)
+    return math.sqrt(noise), found[:n]
+
+
+@njit(cache=True)
+def _ranked(table, n, row):  # type: ignore[no-untyped-def]
+    """Inserts the row into the first n of a table that its last column orders downwards; returns the new n."""
+    if n == table.shape[0] and not row[-1] > table[n - 1, -1]:
+        return n
+    place = min(n, table.shape[0] - 1)
+    while place > 0 and table[place - 1, -1] < row[-1]:
+        table[place] = table[place - 1]
+        place -= 1
+    table[place] = row
+    return min(n + 1, table.shape[0])
