@@ -123,8 +123,8 @@ def main():
         time_large(args.time, 1)
         return
     window = 2.5 * SIGMA + 1.5 if args.window is None else args.window
-    print(f"bound of a centre, CNR 20: {bound(args.radius):.5f} with known levels, {bound(args.radius, window):.5f} with "
-          f"levels from the {window:g} voxels on both sides")
+    print(f"bound of a centre, CNR 20: {bound(args.radius):.5f} with known levels, {bound(args.radius, window):.5f} "
+          f"with levels from the {window:g} voxels on both sides")
     print("voxels: centre rms (3-D), radius bias, radius sd, residual rms, full range, D95, 25 patches")
     table = {}
     for seed in range(1, args.seeds + 1):

@@ -132,15 +132,16 @@ def test_the_picture_shows_the_part_in_the_colours_of_the_map(measured):
     assert np.mean(np.abs(hue - middle / middle.sum()).max(axis=1) < 0.03) > 0.5
 
 
-def test_a_coarse_reference_is_refined_fitted_and_corrected(folder):
+@pytest.mark.parametrize("between", ["cells", "natural"])
+def test_a_coarse_reference_is_refined_fitted_and_corrected(folder, between):
     """A reference of twelve triangles; a measuring machine found its top 10 um higher than nominal."""
     probed = [[x, y, HALF[2] + 0.010] for x in (-1.0, 0.0, 1.0) for y in (-0.8, 0.0, 0.8)]
     (folder / "cmm.csv").write_text("x_mm,y_mm,z_mm\n" + "".join(f"{x},{y},{z}\n" for x, y, z in probed),
                                     encoding="utf-8")
-    out = folder / "corrected"
+    out = folder / f"corrected {between}"
     assert run(folder / "simple.toml", "--volume", folder / "scan1.h5", "--reference", folder / "coarse.stl",
-               "--edge-mm", "0.2", "--cmm-points", folder / "cmm.csv", "--fit", "best-fit", "--search-mm", "0.2",
-               "--out", out, "--quiet") == 0
+               "--edge-mm", "0.2", "--cmm-points", folder / "cmm.csv", "--cmm-interpolation", between, "--fit",
+               "best-fit", "--search-mm", "0.2", "--out", out, "--quiet") == 0
     table = np.genfromtxt(out / "comparison.csv", delimiter=",", skip_header=1)
     x, d = table[:, :3] - CENTRE, table[:, 3]
     inner = (np.abs(x[:, 0]) < 1.2) & (np.abs(x[:, 1]) < 0.9)
@@ -257,8 +258,9 @@ class TestRefused:
             run(folder / "simple.toml", "--volume", folder / "scan1.h5", "--reference", folder / "part.stl", "--fit",
                 "datum", "--out", folder / "refused")
 
-    def test_an_unknown_fit(self, folder):
-        assert run(folder / "plan.toml", "--volume", folder / "scan1.h5", "--fit", "good", "--out", folder / "r") == 2
+    @pytest.mark.parametrize("option", ["--fit", "--cmm-interpolation"])
+    def test_an_unknown_choice(self, folder, option):
+        assert run(folder / "plan.toml", "--volume", folder / "scan1.h5", option, "good", "--out", folder / "r") == 2
 
     def test_an_empty_volume(self, folder):
         empty = block()

@@ -12,6 +12,7 @@ from tomopose.cli.common import OK, USAGE, ForceOption, JsonOption, QuietOption,
 
 EPILOG = "Example: tomopose measure plan.toml --volume before=scan1.h5 --volume after=scan2.h5 --out measured"
 FITS = ("none", "datum", "best-fit")
+BETWEEN = ("cells", "natural")
 
 
 def register(app: typer.Typer) -> None:
@@ -48,6 +49,10 @@ def measure(
     probed: Annotated[
         Path | None, typer.Option("--cmm-points", help="CSV x_mm,y_mm,z_mm: shift the reference to probed points.")
     ] = None,
+    between: Annotated[
+        str,
+        typer.Option("--cmm-interpolation", help="Between probed points: cells (Voronoi) or natural (blended cells)."),
+    ] = "cells",
     range_um: Annotated[float, typer.Option("--range-um", min=0.001, help="Colours are clipped at +- so much.")] = 25.0,
     search_mm: Annotated[
         float | None, typer.Option("--search-mm", min=0.0, help="How far surface and reference may lie apart.")
@@ -91,6 +96,9 @@ def measure(
     if fit not in FITS:
         say.note(f"--fit is {', '.join(FITS)}")
         return USAGE
+    if between not in BETWEEN:
+        say.note(f"--cmm-interpolation is {', '.join(BETWEEN)}")
+        return USAGE
     if bool(calibration) != bool(poses):
         say.note("--calibration and --poses belong together")
         return USAGE
@@ -98,7 +106,7 @@ def measure(
     require_absent(out / "measurement.json", force=force)
     wanted = read_plan(plan)
     files = named_files(volume, "volume")
-    mesh = None if reference is None else reference_of(reference, edge_mm, probed)
+    mesh = None if reference is None else reference_of(reference, edge_mm, probed, between)
     volumes = {name: read_volume(file) for name, file in files.items()}
     calibrations, scans = (named_files(x or (), w, default="") for x, w in ((calibration, "calibration"),
                                                                            (poses, "poses")))
@@ -106,6 +114,7 @@ def measure(
     made = provenance(
         inputs=[*given, *(p for p in (reference, probed, scene) if p is not None)], seed=seed if scene else None,
         arguments=arguments(fit=fit, range_um=range_um, search_mm=search_mm, edge_mm=edge_mm,
+                            cmm_interpolation=between if probed else None,
                             draws=draws if scene else None, simulate_voxel=coarser if scene else None),
     )
     with say.progress("measuring") as progress:
@@ -129,7 +138,7 @@ def measure(
     return OK
 
 
-def reference_of(path: Path, edge_mm: float | None, probed: Path | None) -> Any:
+def reference_of(path: Path, edge_mm: float | None, probed: Path | None, between: str) -> Any:
     """The reference mesh, of smaller triangles and corrected by probed points where that is asked for."""
     from tomopose.measurement.mesh_refine import refined
     from tomopose.measurement.meshes import read_mesh
@@ -138,7 +147,9 @@ def reference_of(path: Path, edge_mm: float | None, probed: Path | None) -> Any:
     mesh = read_mesh(path)
     if edge_mm is not None:
         mesh = refined(mesh, edge_mm)
-    return mesh if probed is None else corrected_reference(mesh, read_probed_points(probed))
+    if probed is None:
+        return mesh
+    return corrected_reference(mesh, read_probed_points(probed), interpolation=between)  # type: ignore[arg-type]
 
 
 def compared(volume: Any, mesh: Any, alignment: Any, *, fit: str, search_mm: float | None) -> Any:
