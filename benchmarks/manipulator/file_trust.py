@@ -3,8 +3,7 @@
 Usage: python benchmarks/manipulator/file_trust.py [--seeds 24]
 
 189 poses, then a scan of 8 deg; rms over seeds of the scan's error at the corners of the box, px, with what is stated
-in brackets: the file doubted by its 5 % alone, the file believed, and the average by evidence, which is what `calibrate`
-gives.
+in brackets: the file doubted by its 5 % alone, the file believed, and the average by evidence, which `calibrate` gives.
 """
 
 from __future__ import annotations

@@ -116,6 +116,22 @@ def test_commands_move_the_scanner_where_it_was_wanted(gantry):
     assert commanded < plain / 10
 
 
+def test_a_moving_scanner_of_unknown_kinematics(gantry, capsys):
+    """A map of pose errors serves the inverse chain too, and says what the balls cannot tell."""
+    folder, truth = gantry[0], gantry[4]
+    moving = ("--arrangement", "moving-scanner")
+    assert calibrate(folder, "rigid", *moving, "--model", "rigid") == 3
+    assert calibrate(folder, "slack", *moving, "--model", "slack") in (0, 3)
+    error = {}
+    for name in ("rigid", "slack"):
+        assert matrices(folder, name) == 0
+        found = tp.read_matrices(folder / f"{name}.npz")
+        error[name] = rms_px(without_object_pose(found.P, truth, CORNERS))
+    assert error["slack"] < error["rigid"]
+    assert calibrate(folder, "x", *moving, "--model", "slack", "--d-sd-sigma-mm", "0.2") == 1
+    assert "cannot be told from poses that scatter" in capsys.readouterr().err
+
+
 def test_a_scanner_that_moves_is_named(gantry):
     folder = gantry[0]
     assert calibrate(folder, "wrong") == 3
