@@ -84,7 +84,7 @@ def test_profiles_are_convolutions(kappa: float) -> None:
         tolerance = 1e-9 if np.isinf(kappa) else 2e-5
         assert table[i, 0] == pytest.approx(convolved(through) + box, abs=tolerance)
         assert table[i, 3] == pytest.approx(convolved(lambda x: x * through(x)), abs=10 * tolerance)
-        assert table[i, 8] == pytest.approx(convolved(lambda x: max(x, 0.0) ** 2 / 2), abs=1e-8)
+        assert table[i, 4] == pytest.approx(convolved(lambda x: max(x, 0.0) ** 2 / 2), abs=1e-8)
 
 
 def test_simulation_and_model_agree_without_noise_and_holder(tilted: Scanner) -> None:

@@ -68,56 +68,53 @@ def silhouette_ellipse(scanner: Scanner, x_D: Array, gamma: float) -> tuple[Arra
     return centre, float(axes[major]), float(axes[1 - major]), angle
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def cone_coordinates(u, v, inverse_K, p_u, p_v, u_c, v_c, gamma):  # type: ignore[no-untyped-def]
     """(6, n): s, ds/du_c, ds/dv_c, ds/dgamma, cos psi, sin psi for pixels u, v (n,).
 
+    With d = K^-1 [u, v, 1] and the axis m of unit length: theta = atan2(|d x m|, d.m), and tan(theta - gamma) is small.
     The derivatives leave out the change of |grad theta|, a factor 1 + O(s / radius) that vanishes on the rim.
     """
     n = u.shape[0]
     out = np.empty((6, n))
-    K = inverse_K
-    p = math.sqrt(p_u * p_v)
-    m0 = K[0, 0] * u_c + K[0, 1] * v_c + K[0, 2]
-    m1 = K[1, 0] * u_c + K[1, 1] * v_c + K[1, 2]
-    m2 = K[2, 0] * u_c + K[2, 1] * v_c + K[2, 2]
-    m_length = math.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
-    m0, m1, m2 = m0 / m_length, m1 / m_length, m2 / m_length
-    mk_u = m0 * K[0, 0] + m1 * K[1, 0] + m2 * K[2, 0]
-    mk_v = m0 * K[0, 1] + m1 * K[1, 1] + m2 * K[2, 1]
+    U0, U1, U2 = inverse_K[0, 0], inverse_K[1, 0], inverse_K[2, 0]
+    V0, V1, V2 = inverse_K[0, 1], inverse_K[1, 1], inverse_K[2, 1]
+    W0, W1, W2 = inverse_K[0, 2], inverse_K[1, 2], inverse_K[2, 2]
+    m0, m1, m2 = U0 * u_c + V0 * v_c + W0, U1 * u_c + V1 * v_c + W1, U2 * u_c + V2 * v_c + W2
+    length = math.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
+    m0, m1, m2 = m0 / length, m1 / length, m2 / length
+    mU, mV = m0 * U0 + m1 * U1 + m2 * U2, m0 * V0 + m1 * V1 + m2 * V2
+    per_p, per_length = 1.0 / math.sqrt(p_u * p_v), 1.0 / length
     cos_gamma, sin_gamma = math.cos(gamma), math.sin(gamma)
     for i in range(n):
-        d0 = K[0, 0] * u[i] + K[0, 1] * v[i] + K[0, 2]
-        d1 = K[1, 0] * u[i] + K[1, 1] * v[i] + K[1, 2]
-        d2 = K[2, 0] * u[i] + K[2, 1] * v[i] + K[2, 2]
-        shorter = 1.0 / math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-        d0, d1, d2 = d0 * shorter, d1 * shorter, d2 * shorter
-        c0, c1, c2 = d1 * m2 - d2 * m1, d2 * m0 - d0 * m2, d0 * m1 - d1 * m0
-        sine = math.sqrt(c0 * c0 + c1 * c1 + c2 * c2) + 1e-300
-        cosine = d0 * m0 + d1 * m1 + d2 * m2
-        dk_u = d0 * K[0, 0] + d1 * K[1, 0] + d2 * K[2, 0]
-        dk_v = d0 * K[0, 1] + d1 * K[1, 1] + d2 * K[2, 1]
-        per_sine = 1.0 / sine
-        g_u = -(mk_u - cosine * dk_u) * (shorter * per_sine / p_u)
-        g_v = -(mk_v - cosine * dk_v) * (shorter * per_sine / p_v)
-        flatter = 1.0 / (math.sqrt(g_u * g_u + g_v * g_v) + 1e-300)
-        scale = flatter / p
-        out[0, i] = _angle(sine * cos_gamma - cosine * sin_gamma, cosine * cos_gamma + sine * sin_gamma) * scale
-        out[1, i] = -(dk_u - cosine * mk_u) * (per_sine * scale / m_length)
-        out[2, i] = -(dk_v - cosine * mk_v) * (per_sine * scale / m_length)
+        d0, d1, d2 = U0 * u[i] + V0 * v[i] + W0, U1 * u[i] + V1 * v[i] + W1, U2 * u[i] + V2 * v[i] + W2
+        along = d0 * m0 + d1 * m1 + d2 * m2
+        a0, a1, a2 = d0 - along * m0, d1 - along * m1, d2 - along * m2
+        across_square = a0 * a0 + a1 * a1 + a2 * a2 + 1e-300
+        across = math.sqrt(across_square)
+        per_across = 1.0 / across
+        aU, aV = a0 * U0 + a1 * U1 + a2 * U2, a0 * V0 + a1 * V1 + a2 * V2
+        # grad theta = (along grad across - across grad along) / |d|^2, times across |d|^2.
+        g_u, g_v = (along * aU - across_square * mU) / p_u, (along * aV - across_square * mV) / p_v
+        per_g = 1.0 / math.sqrt(g_u * g_u + g_v * g_v + 1e-300)
+        scale = across * (across_square + along * along) * per_g * per_p
+        t = (across * cos_gamma - along * sin_gamma) / (along * cos_gamma + across * sin_gamma)
+        x = t * t
+        series = 1 / 3 - x * (1 / 5 - x * (1 / 7 - x * (1 / 9 - x * (1 / 11 - x / 13))))
+        out[0, i] = scale * t * (1.0 - x * series)
+        out[1, i] = -aU * (per_across * scale * per_length)
+        out[2, i] = -aV * (per_across * scale * per_length)
         out[3, i] = -scale
-        out[4, i] = g_u * flatter
-        out[5, i] = g_v * flatter
+        out[4, i] = g_u * per_g
+        out[5, i] = g_v * per_g
     return out
 
 
-@njit(cache=True, fastmath=True, inline="always")
-def _angle(sine, cosine):  # type: ignore[no-untyped-def]
-    """The angle of that sine and cosine; near 0 by the arc sine's series, which is exact to 1e-16 there."""
-    x = sine * sine
-    if x > 1e-3 or cosine < 0.0:
-        return math.atan2(sine, cosine)
-    return sine * (1.0 + x * (1 / 6 + x * (3 / 40 + x * (15 / 336 + x * (105 / 3456 + x * (945 / 42240))))))
+@njit(cache=True, fastmath=True)
+def follow(rim, du, dv, dgamma):  # type: ignore[no-untyped-def]
+    """Adds to the distances of `rim` (6, n) what a small move of the cone changes, to first order."""
+    for i in range(rim.shape[1]):
+        rim[0, i] += rim[1, i] * du + rim[2, i] * dv + rim[3, i] * dgamma
 
 
 @njit(cache=True, fastmath=True, inline="always")
@@ -143,11 +140,21 @@ def ring_pixels(window, good, u_first, v_first, u_c, v_c, low, high, ratio_u, ra
 
     every: one pixel in so many is taken, on a lattice that has as large a share in each row and column.
     """
+    return thinned_ring(window, good, u_first, v_first, u_c, v_c, low, high, ratio_u, ratio_v, every, np.inf, high)[:3]
+
+
+@njit(cache=True)
+def thinned_ring(  # type: ignore[no-untyped-def]
+    window, good, u_first, v_first, u_c, v_c, low, high, ratio_u, ratio_v, every, many, near
+):  # fmt: skip
+    """ring_pixels, without every second one of those farther than `near` if there are more than `many`; whether so."""
     rows, columns = window.shape
-    n = 0
+    n, near_square, thinned = 0, np.inf, False
     for turn in range(2):
         if turn == 1:
             u, v, value = np.empty(n), np.empty(n), np.empty(n)
+            thinned = n > many
+            near_square = near * near if thinned else np.inf
         n = 0
         for j in range(rows):
             dv = (j + v_first - v_c) * ratio_v
@@ -158,17 +165,20 @@ def ring_pixels(window, good, u_first, v_first, u_c, v_c, low, high, ratio_u, ra
             gap = low * low - dv * dv if low > 0.0 else -1.0
             hole = math.sqrt(gap) / ratio_u if gap > 0.0 else -1.0
             first, last = max(0, math.ceil(middle - reach)), min(columns - 1, math.floor(middle + reach))
-            i = first
-            while i <= last:
-                if abs(i - middle) < hole:
-                    i = max(i + 1, math.ceil(middle + hole))
-                    continue
-                if good[j, i] and (every == 1 or (i + 2 * j) % every == 0):
-                    if turn == 1:
-                        u[n], v[n], value[n] = i + u_first, j + v_first, window[j, i]
-                    n += 1
-                i += 1
-    return u, v, value
+            for side in range(2):
+                start = first if side == 0 else max(first, math.ceil(middle + hole))
+                stop = min(last, math.floor(middle - hole)) if side == 0 and hole >= 0.0 else last
+                if side == 1 and hole < 0.0:
+                    break
+                for i in range(start + (-start - 2 * j) % every, stop + 1, every):
+                    if good[j, i]:
+                        du = (i - middle) * ratio_u
+                        if du * du + dv * dv > near_square and (i + u_first + j + v_first) % 2 == 1:
+                            continue
+                        if turn == 1:
+                            u[n], v[n], value[n] = i + u_first, j + v_first, window[j, i]
+                        n += 1
+    return u[:n], v[:n], value[:n], thinned
 
 
 @njit(cache=True, fastmath=True)
@@ -181,34 +191,28 @@ def by_sector(u, v, value, rim, low, high, thin_from, k, edges):  # type: ignore
     """
     turn, shells = k / (2.0 * math.pi), edges.shape[0] + 1
     cell, part = np.empty(u.shape[0], np.int64), np.empty(u.shape[0])
+    for i in range(u.shape[0]):
+        angle = _direction(rim[4, i], rim[5, i]) * turn
+        node = min(int(angle), k - 1)
+        cell[i], part[i] = node * shells, angle - node
     first = np.zeros(k * shells + 1, np.int64)
     for i in range(u.shape[0]):
         s = rim[0, i]
-        cell[i] = -1
         if s > low and s < high and (s < thin_from or (int(u[i]) + int(v[i])) % 2 == 0):
-            angle = _direction(rim[4, i], rim[5, i]) * turn
-            node = min(int(angle), k - 1)
-            shell = 0
-            while shell < shells - 1 and s > edges[shell]:
-                shell += 1
-            cell[i], part[i] = node * shells + shell, angle - node
+            for edge in edges:
+                cell[i] += s > edge
             first[cell[i] + 1] += 1
+        else:
+            cell[i] = -1
     for j in range(k * shells):
         first[j + 1] += first[j]
-    n = first[k * shells]
-    place = first.copy()
-    new_u, new_v, new_value, share, left = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n, np.int64)
-    new_rim = np.empty((6, n))
+    n, place = first[k * shells], first.copy()
     source = np.empty(n, np.int64)
     for i in range(u.shape[0]):
         if cell[i] >= 0:
             source[place[cell[i]]] = i
             place[cell[i]] += 1
-    for at in range(n):
-        i = source[at]
-        new_u[at], new_v[at], new_value[at], share[at] = u[i], v[i], value[i], part[i]
-        left[at] = cell[i] // shells
+    new_rim = np.empty((6, n))
     for c in range(6):
-        for at in range(n):
-            new_rim[c, at] = rim[c, source[at]]
-    return new_u, new_v, new_value, new_rim, left, share, first
+        new_rim[c] = rim[c][source]
+    return u[source], v[source], value[source], new_rim, cell[source] // shells, part[source], first

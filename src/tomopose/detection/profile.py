@@ -20,8 +20,9 @@ from numba import njit
 
 from tomopose.units import Array
 
-COLUMNS = 10
-"""O, O', O'', R, R', R'', dO/dkappa, dR/dkappa, Q, Q'."""
+OPAQUE, COLUMNS = 5, 10
+"""O, O', O'', R, Q and, where X-rays pass the ball, R', R'', dO/dkappa, dR/dkappa, Q'; of an opaque one R' = O,
+R'' = O' and Q' = R."""
 
 STEPS_PER_SIGMA = 32
 REACH = 6.0
@@ -33,7 +34,7 @@ It adds kappa_4 / 24 times the fourth derivative of O."""
 
 
 def edge_profile(sigma: float, kappa: float, radius: float, s_low: float, s_high: float) -> tuple[Array, float, float]:
-    """(table (n, 10), first s, step): the profiles for s in [s_low, s_high]; kappa = inf is an opaque ball."""
+    """(table (n, 5 or 10), first s, step): the profiles for s in [s_low, s_high]; kappa = inf is an opaque ball."""
     step = sigma / STEPS_PER_SIGMA
     n = math.ceil((s_high - s_low) / step) + 2
     return _table(sigma, kappa, radius, s_low, step, n), s_low, step
@@ -41,7 +42,8 @@ def edge_profile(sigma: float, kappa: float, radius: float, s_low: float, s_high
 
 @njit(cache=True)
 def _table(sigma, kappa, radius, first, step, n):  # type: ignore[no-untyped-def]
-    out = np.zeros((n, COLUMNS))
+    opaque = math.isinf(kappa)
+    out = np.zeros((n, OPAQUE if opaque else COLUMNS))
     for i in range(n):
         s = first + i * step
         x = s / sigma
@@ -51,14 +53,12 @@ def _table(sigma, kappa, radius, first, step, n):  # type: ignore[no-untyped-def
         out[i, 1] = phi
         out[i, 2] = -x / sigma * phi
         out[i, 3] = s * Phi + sigma * sigma * phi
-        out[i, 4] = Phi
-        out[i, 5] = phi
-        out[i, 8] = 0.5 * ((s * s + sigma * sigma) * Phi + s * sigma * sigma * phi)
-        out[i, 9] = out[i, 3]
-    if math.isinf(kappa):
-        return out
-    for i in range(n):
-        _add_inside(out, i, first + i * step, sigma, kappa, radius)
+        out[i, 4] = 0.5 * ((s * s + sigma * sigma) * Phi + s * sigma * sigma * phi)
+        if not opaque:
+            out[i, 5] = Phi
+            out[i, 6] = phi
+            out[i, 9] = out[i, 3]
+            _add_inside(out, i, s, sigma, kappa, radius)
     return out
 
 
@@ -82,7 +82,7 @@ def _add_inside(out, i, s, sigma, kappa, radius):  # type: ignore[no-untyped-def
         out[i, 1] += t * first
         out[i, 2] += t * second
         out[i, 3] -= t * depth
-        out[i, 4] -= t * depth * first
-        out[i, 5] -= t * depth * second
-        out[i, 6] -= t * chord
-        out[i, 7] += t * chord * depth
+        out[i, 5] -= t * depth * first
+        out[i, 6] -= t * depth * second
+        out[i, 7] -= t * chord
+        out[i, 8] += t * chord * depth

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
 
 from tomopose.detection.cholesky import solve
-from tomopose.detection.cone import by_sector, cone_angle, cone_coordinates, cone_eccentricity, ring_pixels
-from tomopose.detection.edges import (
-    FIRST_NODE,
-    N_SHAPE,
-    SHAPE,
-    SHELL_EDGES,
-    SHELLS,
-    WHITE,
-    gradient,
-    model_rows,
-    normal_equations,
-    with_priors,
+from tomopose.detection.cone import (
+    by_sector,
+    cone_angle,
+    cone_coordinates,
+    cone_eccentricity,
+    follow,
+    thinned_ring,
 )
+from tomopose.detection.edges import FIRST_NODE, KAPPA, N_SHAPE, SHAPE, SHELL_EDGES, SHELLS, WHITE, model_rows
+from tomopose.detection.normal import gradient, normal_equations, with_priors
 from tomopose.detection.profile import edge_profile
 from tomopose.errors import BallNotFoundError
 from tomopose.geometry.scanner import Scanner
@@ -32,10 +30,13 @@ MANY, NEAR = 8000, 8.0
 """Of more pixels than this, every second one is left out that lies farther than NEAR px outside the rim."""
 LINEAR = 0.02
 """Largest move, px, after which distances are updated to first order: what is left out is LINEAR^2 / 2 radius."""
-STAY = np.zeros(3)
+STAY = (0.0, 0.0, 0.0)
+EDGES = np.array(SHELL_EDGES)
 FLAT = 5.0
 """Distance from the rim, in widths of the blur, from which the edge is over."""
 SMALLEST_BLUR, LARGEST_STEP = 0.25, 2.0
+TAIL = 6.0
+"""Distance inside the rim, in widths of the blur, beyond which nothing comes through an opaque ball."""
 
 
 class Rim:
@@ -71,28 +72,33 @@ class Rim:
 
     def gather(self) -> None:
         """Takes the pixels of the ring about the current silhouette, one in `every`, and places the angular nodes."""
-        u, v, value, rim = self.ring(self.good, -self.inside, self.outside, self.every)
-        thin_from = NEAR if u.size > MANY and self.every == 1 else self.outside
+        many = MANY if self.every == 1 else math.inf
+        u, v, value, thinned, rim = self.ring(self.good, -self.inside, self.outside, self.every, many)
         self.u, self.v, self.value, self.rim, self.left, self.share, self.bounds = by_sector(
-            u, v, value, rim, -self.inside, self.outside, thin_from, self.n_nodes, np.array(SHELL_EDGES)
+            u, v, value, rim, -self.inside, self.outside, NEAR if thinned else self.outside, self.n_nodes, EDGES
         )
         self.first = self.bounds[::SHELLS]
         n = self.u.size
         if n < 4 * self.n_nodes:
             at = f"({self.shape[0]:.1f}, {self.shape[1]:.1f})"
             raise BallNotFoundError(f"only {n} usable pixels round the rim at {at}")
-        self.model, self.jacobian, self.weight = np.zeros(n), np.zeros((14, n)), np.ones(n)
+        self.model, self.jacobian, self.weight = np.empty(n), np.empty((14, n)), np.ones(n)
         self._sums = None
 
-    def ring(self, good: Array, low: float, high: float, every: int) -> tuple[Array, Array, Array, Array]:
-        """u, v, value (n,) and rim (6, n) of all pixels with s in [low, high], one in `every`, and of some beyond."""
+    def ring(
+        self, good: Array, low: float, high: float, every: int, many: float = math.inf
+    ) -> tuple[Array, Array, Array, bool, Array]:  # fmt: skip
+        """u, v, value (n,) and rim (6, n) of all pixels with s in [low, high], one in `every`, and of some beyond.
+
+        Of more than `many` every second one is left out that lies farther than NEAR px outside; the bool says whether.
+        """
         scanner, radius = self.scanner, self.shape[2]
         margin = self.margin + 0.02 * (high - low)
-        u, v, value = ring_pixels(
+        u, v, value, thinned = thinned_ring(
             self.window, good, self.origin[0], self.origin[1], self.shape[0], self.shape[1], radius + low - margin,
-            radius + high + margin, scanner.p_u / self.p, scanner.p_v / self.p, every,
+            radius + high + margin, scanner.p_u / self.p, scanner.p_v / self.p, every, many, radius + NEAR + margin,
         )  # fmt: skip
-        return u, v, value, self.coordinates(u, v)
+        return u, v, value, thinned, self.coordinates(u, v)
 
     def whole(self) -> bool:
         """Whether the rim lies in the window, and every pixel of the window is good."""
@@ -110,22 +116,31 @@ class Rim:
             cone_coordinates(u, v, self.inverse_K, self.scanner.p_u, self.scanner.p_v, s[0], s[1], s[2] * self.gamma_px)
         )
 
-    def evaluate(self, delta: Array | None = None) -> None:
+    def evaluate(self, delta: tuple[float, float, float] | None = None) -> None:
         """Model and Jacobian after a move `delta` of centre and radius, where it is known.
 
         Distances follow a small move to first order, and stay what they are without one (as after `gather`).
         """
         s = self.shape
-        if delta is None or np.abs(delta).max() > LINEAR:
+        if delta is None or max(map(abs, delta)) > LINEAR:
             self.rim = self.coordinates(self.u, self.v)
-        elif delta.any():
-            self.rim[0] += self.rim[1] * delta[0] + self.rim[2] * delta[1] + self.rim[3] * (delta[2] * self.gamma_px)
-        table, first, step = edge_profile(s[3], s[4], s[2], -self.inside - 4.0, self.outside + 4.0)
+        elif delta != STAY:
+            follow(self.rim, delta[0], delta[1], delta[2] * self.gamma_px)
+        near_shells, high = (1, SHELL_EDGES[0]) if self._ends_near() else (SHELLS, self.outside)
+        low = max(-self.inside, -TAIL * s[3]) if self._opaque() else -self.inside
+        profile, first, step = edge_profile(s[3], s[4], s[2], low - 4.0, min(high, self.outside) + 4.0)
         model_rows(
-            self.rim, self.left, self.share, self.nodes, self.white, table, math.isinf(s[4]), first, step, s[3],
-            self.gamma_px, self.box_u, self.box_v, s[5], s[6], self.model, self.jacobian,
+            self.rim, self.share, self.bounds, near_shells, self.nodes, self.white, profile, self._opaque(), first,
+            step, s[3], self.gamma_px, self.box_u, self.box_v, s[5], s[6], self.model, self.jacobian,
         )  # fmt: skip
         self._sums = None
+
+    def _opaque(self) -> bool:
+        return math.isinf(self.shape[KAPPA])
+
+    def _ends_near(self) -> bool:
+        """Whether the edge is over beyond the first shell."""
+        return self._opaque() and bool(SHELL_EDGES[0] > FLAT * self.shape[3])
 
     @property
     def residual(self) -> Array:
@@ -138,13 +153,7 @@ class Rim:
 
     def columns(self, shell: int) -> npt.NDArray[np.intp]:
         """Rows of the Jacobian that count in a shell: far from the rim an edge's width and height do not."""
-        opaque = math.isinf(self.shape[4])
-        use = np.ones(FIRST_NODE + 6, dtype=bool)
-        use[4], use[5:7] = not opaque, self.turned
-        use[:WHITE] &= not self.linear
-        if shell > 0 and opaque and SHELL_EDGES[0] > FLAT * self.shape[3]:
-            use[[3, 5, 6, WHITE]] = False
-        return np.flatnonzero(use)
+        return _columns(self._opaque(), self.turned, self.linear, shell > 0 and self._ends_near())
 
     def shell_sums(self, low: int, high: int) -> tuple[Array, Array]:
         """Normal matrix and right side of all parameters, without priors, of the shells from low to before high."""
@@ -169,17 +178,10 @@ class Rim:
 
     def with_priors(self, N: Array, g: Array, active: npt.NDArray[np.intp]) -> tuple[Array, Array]:
         """Rows and columns `active` of N and g, priors added."""
-        precision, pull = np.zeros(g.size), np.zeros(g.size)
-        if math.isfinite(self.shape[4]):
-            precision[4] = 1.0 / self.kappa_start**2
-            pull[4] = precision[4] * (self.kappa_start - self.shape[4])
-        precision[WHITE], mean = self.white_prior[1], self.white_prior[0]
-        pull[WHITE] = precision[WHITE] * (mean - self.white)
-        centre = np.zeros_like(self.nodes)
-        centre[:, 0] = self.level
-        precision[FIRST_NODE:] = self.precision
-        pull[FIRST_NODE:] = self.precision * (centre - self.nodes).ravel()
-        return with_priors(N, g, precision, pull, active)
+        part, right = with_priors(
+            N, g, active, self.shape, self.white, self.nodes, self.kappa_start, self.white_prior, self.precision
+        )
+        return part, right
 
     def polish(self, active: npt.NDArray[np.intp], *, careful: bool) -> None:
         """Steps to the optimum near by; with one normal matrix, only the right side following, unless `careful`."""
@@ -199,47 +201,63 @@ class Rim:
         Returns the largest move of centre and radius, px.
         """
         N, g = self.normal(active)
-        delta = solve(N, g[:, None])[:, 0]
         full = np.zeros(FIRST_NODE + 3 * self.n_nodes)
-        full[active] = delta
+        full[active] = solve(N, g[:, None])[:, 0]
+        if not math.isfinite(full.sum()):
+            raise BallNotFoundError("the rim does not determine a ball (no finite step)")
         largest = float(np.abs(full[:3]).max())
         if largest > LARGEST_STEP:
             full[:N_SHAPE] *= LARGEST_STEP / largest
-        if not np.isfinite(full).all():
-            raise BallNotFoundError("the rim does not determine a ball (no finite step)")
         before = (self.shape, self.white, self.nodes)
         cost = self.cost if careful else 0.0
-        self._move(full, active)
+        self._move(full)
         while careful and self.cost > cost and np.abs(full[:3]).max() > 1e-3:
             full = full / 3
             self.shape, self.white, self.nodes = before
-            self._move(full, active)
+            self._move(full)
         return largest
 
     @property
     def cost(self) -> float:
         return float((self.weight * self.residual**2).sum())
 
-    def _move(self, full: Array, active: npt.NDArray[np.intp]) -> None:
+    def _move(self, full: Array) -> None:
         """Adds `full` to the parameters, within their bounds."""
-        s = self.shape.copy()
-        s[active[active < N_SHAPE]] += full[active[active < N_SHAPE]]
-        s[3] = np.clip(s[3], max(SMALLEST_BLUR, self.shape[3] / 2), min(self.shape[3] * 2, 0.45 * s[2]))
-        if math.isfinite(s[4]):
-            s[4] = np.clip(s[4], max(self.shape[4] / 2, 0.1), min(self.shape[4] * 2, 20.0))
+        sigma, kappa = float(self.shape[3]), float(self.shape[KAPPA])
+        s = self.shape + full[:N_SHAPE]
+        s[3] = min(max(float(s[3]), SMALLEST_BLUR, sigma / 2), sigma * 2, 0.45 * float(s[2]))
+        if math.isfinite(kappa):
+            s[KAPPA] = min(max(float(s[KAPPA]), kappa / 2, 0.1), kappa * 2, 20.0)
         self.shape = s
         self.white += full[WHITE]
         self.nodes = self.nodes + full[FIRST_NODE:].reshape(-1, 3)
-        self.evaluate(full[:3])
+        u, v, radius = full[:3].tolist()
+        self.evaluate((u, v, radius))
 
     def active(self, *shape: str, curvature: bool = True) -> npt.NDArray[np.intp]:
-        use = np.zeros(FIRST_NODE + 3 * self.n_nodes, dtype=bool)
-        use[[SHAPE.index(name) for name in shape]] = True
-        use[WHITE:] = True
-        if not curvature:
-            use[FIRST_NODE + 2 :: 3] = False
-        return np.flatnonzero(use)
+        """Indices of the parameters that are fitted: those of the shape, and all linear ones (`curvature`: c too)."""
+        return _active(shape, curvature, self.n_nodes)
 
     @property
     def level(self) -> float:
-        return float(np.mean(self.nodes[:, 0]))
+        return float(self.nodes[:, 0].mean())
+
+
+@cache
+def _columns(opaque: bool, turned: bool, linear: bool, beyond: bool) -> npt.NDArray[np.intp]:
+    use = np.ones(FIRST_NODE + 6, dtype=bool)
+    use[KAPPA], use[5:7] = not opaque, turned
+    use[:WHITE] &= not linear
+    if beyond:
+        use[[3, 5, 6, WHITE]] = False
+    return np.flatnonzero(use)
+
+
+@cache
+def _active(shape: tuple[str, ...], curvature: bool, n_nodes: int) -> npt.NDArray[np.intp]:
+    use = np.zeros(FIRST_NODE + 3 * n_nodes, dtype=bool)
+    use[[SHAPE.index(name) for name in shape]] = True
+    use[WHITE:] = True
+    if not curvature:
+        use[FIRST_NODE + 2 :: 3] = False
+    return np.flatnonzero(use)

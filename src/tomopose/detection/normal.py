@@ -1,0 +1,108 @@
+"""Normal equations of the fit, sector by sector: N = J' W J and g = J' W (image - model)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from tomopose.detection.edges import FIRST_NODE, KAPPA, SHELLS, WHITE
+
+
+@njit(cache=True, fastmath=True)
+def normal_equations(image, value, jacobian, first, weight, columns, low, high):  # type: ignore[no-untyped-def]
+    """(N, g): weighted normal matrix (8 + 3k, 8 + 3k) and right side J' W (image - value) of the shells low to high.
+
+    first: (k SHELLS + 1,) of by_sector.  columns: rows of the Jacobian that count (the others are left 0).  Within a
+    sector every entry is one sum along the pixels, which runs in registers.
+    """
+    k = (first.shape[0] - 1) // SHELLS
+    size = FIRST_NODE + 3 * k
+    N = np.zeros((size, size))
+    g = np.zeros(size)
+    longest = 0
+    for node in range(k):
+        longest = max(longest, first[node * SHELLS + high] - first[node * SHELLS + low])
+    row = np.empty(longest)
+    for node in range(k):
+        start = first[node * SHELLS + low]
+        n = first[node * SHELLS + high] - start
+        if n == 0:
+            continue
+        w, y, y_model = weight[start : start + n], image[start : start + n], value[start : start + n]
+        for i_p in range(columns.shape[0]):
+            p = columns[i_p]
+            at_p = _place(p, node, k)
+            a = jacobian[p, start : start + n]
+            total = 0.0
+            for i in range(n):
+                row[i] = a[i] * w[i]
+                total += row[i] * (y[i] - y_model[i])
+            g[at_p] += total
+            for i_q in range(i_p + 1):
+                q = columns[i_q]
+                at_q = _place(q, node, k)
+                b = jacobian[q, start : start + n]
+                total = 0.0
+                for i in range(n):
+                    total += row[i] * b[i]
+                N[at_p, at_q] += total
+                if i_p != i_q:
+                    N[at_q, at_p] += total
+    return N, g
+
+
+@njit(cache=True, inline="always")
+def _place(p, node, k):  # type: ignore[no-untyped-def]
+    """Where parameter p of a sector's Jacobian stands among all parameters."""
+    if p < FIRST_NODE:
+        return p
+    if p < FIRST_NODE + 3:
+        return p + 3 * node
+    return p - 3 + 3 * (node + 1 if node + 1 < k else 0)
+
+
+@njit(cache=True, fastmath=True)
+def gradient(image, value, jacobian, first, weight, columns, high):  # type: ignore[no-untyped-def]
+    """g alone of normal_equations, of the shells before `high`."""
+    k = (first.shape[0] - 1) // SHELLS
+    g = np.zeros(FIRST_NODE + 3 * k)
+    for node in range(k):
+        start, stop = first[node * SHELLS], first[node * SHELLS + high]
+        for i_p in range(columns.shape[0]):
+            p = columns[i_p]
+            total = 0.0
+            for i in range(start, stop):
+                total += jacobian[p, i] * weight[i] * (image[i] - value[i])
+            g[_place(p, node, k)] += total
+    return g
+
+
+@njit(cache=True)
+def with_priors(N, g, active, shape, white, nodes, kappa_start, white_prior, node_precision):  # type: ignore[no-untyped-def]
+    """Rows and columns `active` of N and g, priors added.
+
+    kappa_start: mean and standard deviation of kappa's prior.  white_prior: mean and precision of w's.  node_precision:
+    (3k,) of a, about the mean level, and of b and c, about 0.
+    """
+    precision, pull = np.zeros(g.shape[0]), np.zeros(g.shape[0])
+    if math.isfinite(shape[KAPPA]):
+        precision[KAPPA] = 1.0 / kappa_start**2
+        pull[KAPPA] = precision[KAPPA] * (kappa_start - shape[KAPPA])
+    precision[WHITE] = white_prior[1]
+    pull[WHITE] = white_prior[1] * (white_prior[0] - white)
+    level = np.mean(nodes[:, 0])
+    for j in range(nodes.shape[0]):
+        for c in range(3):
+            i = FIRST_NODE + 3 * j + c
+            precision[i] = node_precision[3 * j + c]
+            pull[i] = precision[i] * ((level if c == 0 else 0.0) - nodes[j, c])
+    n = active.shape[0]
+    part, right = np.empty((n, n)), np.empty(n)
+    for i in range(n):
+        right[i] = g[active[i]] + pull[active[i]]
+        for j in range(n):
+            part[i, j] = N[active[i], active[j]]
+        part[i, i] += precision[active[i]]
+    return part, right
