@@ -55,6 +55,7 @@ class CpuEngine:
             np.zeros(0, dtype=np.uint8) if support is None
             else np.ascontiguousarray(support.transpose(2, 1, 0), dtype=np.uint8).reshape(-1)
         )
+        self._layers = layers_of(support, grid)
         self.threads = processors() if threads is None else threads
         self.vector = kernels == "vector"
         self._geometry = index_geometry(matrices, grid)
@@ -110,7 +111,7 @@ class CpuEngine:
         def part(start: int, stop: int) -> None:
             kernels.back_columns(
                 flat, self.grid.n_xyz, P, pixels, (n_u, n_v), scale, weight == "inverse-square", weight == "mean",
-                nonnegative, self._support, self.vector, start, stop,
+                nonnegative, self._support, self._layers, self.vector, start, stop,
             )
 
         self._share(part, self.grid.n_xyz[0], TILE)
@@ -158,6 +159,16 @@ class CpuEngine:
 
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "_pool": None}
+
+
+def layers_of(support: np.ndarray | None, grid: VoxelGrid) -> np.ndarray:
+    """Flat [x, y, 2]: the first layer of the support in each column and the one after its last; empty without one."""
+    if support is None:
+        return np.zeros(0, dtype=np.int32)
+    some = support.any(axis=0)
+    first, last = support.argmax(axis=0), grid.shape[0] - support[::-1].argmax(axis=0)
+    ends = np.stack([np.where(some, first, 0), np.where(some, last, 0)], axis=-1)
+    return np.ascontiguousarray(ends.transpose(1, 0, 2), dtype=np.int32).reshape(-1)
 
 
 def availability() -> Availability:

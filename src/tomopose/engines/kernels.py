@@ -130,14 +130,14 @@ def _back_column_plain(
 @njit(cache=True, nogil=True)
 def back_columns(
     volume: Any, shape: Any, P: Any, images: Any, detector: Any, scale: float, inverse_square: bool, mean: bool,
-    nonnegative: bool, support: Any, vector: bool, x_0: int, x_1: int,
+    nonnegative: bool, support: Any, layers: Any, vector: bool, x_0: int, x_1: int,
 ) -> None:
     """Add views to the columns x_0 <= x < x_1 of a volume.
 
     volume: flat, with margins; shape: (n_x, n_y, n_z); P: (m, 3, 4), index to pixel; images: (m, flat with border);
     detector: (n_u, n_v).  Adds scale times the sum of the views' look-ups, or with `mean` scale times their mean over
     the views that see the voxel; `inverse_square` weights each by 1/w^2.  support: flat [x, y, z] without margins, 0
-    where a voxel has to stay 0, or empty.
+    where a voxel has to stay 0, or empty; layers: flat [x, y, 2], where it begins and ends in each column.
     """
     _n_x, n_y, n_z = shape
     n_u, n_v = detector
@@ -151,11 +151,17 @@ def back_columns(
         for x in range(x_0, x_1):
             for y in range(y_0, min(y_0 + TILE, n_y)):
                 at = (x + 1) * s_x + (y + 1) * s_y + 1
+                low, high = 0, n_z
+                if support.size:
+                    low, high = layers[2 * (x * n_y + y)], layers[2 * (x * n_y + y) + 1]
+                    if high <= low:
+                        continue
                 if many:
                     sums[:] = 0.0
                     counts[:] = 0
                 for j in range(len(P)):
                     z_0, z_1 = seen_layers(P[j], x, y, n_z, n_u, n_v)
+                    z_0, z_1 = max(z_0, low), min(z_1, high)
                     if z_1 <= z_0:
                         continue
                     if many:
@@ -179,7 +185,7 @@ def back_columns(
                             volume[at + z] += F32(scale) * sums[z] / F32(seen)
                 if support.size:
                     inside = (x * n_y + y) * n_z
-                    for z in range(n_z):
+                    for z in range(low, high):
                         if not support[inside + z]:
                             volume[at + z] = 0.0
                 if nonnegative:

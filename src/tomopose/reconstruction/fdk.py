@@ -1,4 +1,4 @@
-r"""Filtered back-projection from projection matrices: exact in the mid-plane of a circle, a start elsewhere.
+r"""Filtered back-projection from projection matrices, the ramp along the source's path.
 
 Feldkamp, Davis and Kress (J. Opt. Soc. Am. A 1 (1984) 612), with the source at distance R from the centre of the path,
 the panel at distance d_SD along its own normal and w the depth of a voxel along that normal:
@@ -7,12 +7,22 @@ the panel at distance d_SD along its own normal and w the depth of a voxel along
     q_j  = p_u \sum_n h_n  c p_j(u - n, v),   c = d_SD / sqrt(d_SD^2 + ((u - u_0) p_u)^2 + ((v - v_0) p_v)^2),
 
 h the band-limited ramp: h_0 = 1 / (4 p_u^2), h_n = -1 / (pi n p_u)^2 for odd n and 0 for even n (Kak and Slaney,
-Principles of Computerized Tomographic Imaging, eq. 3.61).  Rows are filtered along u whatever the path: on tilted paths
-that direction is not the path's, which is why FDK alone leaves errors there that SART removes.
+Principles of Computerized Tomographic Imaging, eq. 3.61).  Its transfer is |k_u|.
+
+Where the source rises and falls on its way a(beta), rows are not the right direction.  A view knows the object's
+Fourier components k in the plane of its panel.  Each k is known wherever the path crosses the plane through its centre
+across k, M(k) times, and from 1 / |k . a'| of the views about each crossing: the sum of all is right where the transfer
+of a view is
+
+    (2 / M(k)) |t_u k_u + t_v k_v|,   t = a' / R along the panel's axes,
+
+which is |k_u| on a circle.  With far sources that is exact on every path that meets all planes; M is counted for the
+planes through the centre, so that sources at hand leave an error where planes beside it are crossed more or less often.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +31,9 @@ import scipy.fft
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.reconstruction.path import SourcePath
 from tomopose.units import Array
+
+DIRECTIONS = 180
+"""Of k on the panel, over half a turn, in which crossings are counted."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +55,18 @@ def ramp_filter(n_u: int, p_u: float) -> RampFilter:
     return RampFilter(transfer=(p_u * scipy.fft.rfft(h).real).astype(np.float32), length=length)
 
 
+def crossings(path: SourcePath, axes: Array) -> np.ndarray:
+    """(n, DIRECTIONS) float32: M, how often the path crosses the plane through its centre whose normal lies on the
+    panel of view j, axes (n, 2, 3), at i pi / DIRECTIONS from u towards v; an even number, 2 on a circle."""
+    psi = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
+    towards = (path.arm / path.distance[:, None])[np.argsort(path.angle, kind="stable")]
+    out = np.empty((len(axes), DIRECTIONS), dtype=np.float32)
+    for j, (e_u, e_v) in enumerate(axes):
+        above = (np.cos(psi)[:, None] * e_u + np.sin(psi)[:, None] * e_v) @ towards.T > 0
+        out[j] = np.maximum((above != np.roll(above, 1, axis=1)).sum(axis=1), 2)
+    return out
+
+
 class FdkFilter:
     """Weights and filters single views, ready for back-projection with weight "inverse-square"."""
 
@@ -51,6 +76,12 @@ class FdkFilter:
         self._p = matrices.p_u, matrices.p_v
         self._n = matrices.n_u, matrices.n_v
         self._ramp = ramp_filter(matrices.n_u, matrices.p_u)
+        self._rows_only = path.circular or not path.smooth
+        if not self._rows_only:
+            axes = np.stack([self._rays.U, self._rays.V], axis=1)
+            axes /= np.linalg.norm(axes, axis=2, keepdims=True)
+            self._crossings = crossings(path, axes)
+            self._t = np.einsum("jab,jb->ja", axes, path.tangent) / path.distance[:, None]
 
     def cosine(self, j: int) -> Array:
         """(n_v, n_u): d_SD over the length of each pixel's ray, view j."""
@@ -59,13 +90,33 @@ class FdkFilter:
         d = self._rays.d_SD[j]
         return d / np.sqrt(d**2 + a**2 + b[:, None] ** 2)
 
+    def along_rows(self, image: np.ndarray) -> np.ndarray:
+        """The ramp along u."""
+        spectrum = scipy.fft.rfft(image, n=self._ramp.length, axis=1, workers=self._threads)
+        spectrum *= self._ramp.transfer
+        return np.asarray(scipy.fft.irfft(spectrum, n=self._ramp.length, axis=1, workers=self._threads))
+
+    def along_path(self, image: np.ndarray, j: int) -> np.ndarray:
+        """The ramp along the path's direction in view j, each k over how often it is known."""
+        t_u, t_v = self._t[j]
+        # Along v a line of slope t_v / t_u through the whole of a row must not wrap around.
+        room = 1 + min(abs(t_v / t_u) if t_u else 1.0, 1.0)
+        size = int(scipy.fft.next_fast_len(math.ceil(room * self._n[1]), real=True)), self._ramp.length
+        k_u = scipy.fft.rfftfreq(size[1], self._p[0]).astype(np.float32)
+        k_v = scipy.fft.fftfreq(size[0], self._p[1]).astype(np.float32)[:, None]
+        k = np.abs(np.float32(t_u) * k_u + np.float32(t_v) * k_v)
+        # The band-limited ramp differs from k near 0, where it keeps a wide object's level.
+        transfer = np.interp(k, k_u, self._ramp.transfer).astype(np.float32) + np.maximum(k - k_u[-1], 0)
+        psi = np.arctan2(k_v, k_u) * np.float32(DIRECTIONS / np.pi)
+        transfer *= 2 / self._crossings[j][np.rint(psi).astype(np.int16) % DIRECTIONS]
+        spectrum = scipy.fft.rfft2(image, s=size, workers=self._threads)
+        spectrum *= transfer
+        return np.asarray(scipy.fft.irfft2(spectrum, s=size, workers=self._threads))
+
     def __call__(self, image: np.ndarray, j: int) -> np.ndarray:
         """The line integrals (n_v, n_u) of view j, weighted and filtered, times the view's share of the sum."""
-        n_u = self._n[0]
-        spectrum = scipy.fft.rfft(
-            (image * self.cosine(j)).astype(np.float32), n=self._ramp.length, axis=1, workers=self._threads
-        )
-        spectrum *= self._ramp.transfer
-        filtered = scipy.fft.irfft(spectrum, n=self._ramp.length, axis=1, workers=self._threads)[:, :n_u]
+        n_u, n_v = self._n
+        weighted = (image * self.cosine(j)).astype(np.float32)
+        filtered = (self.along_rows(weighted) if self._rows_only else self.along_path(weighted, j))[:n_v, :n_u]
         share = 0.5 * self._path.weight[j] * self._path.distance[j] * self._rays.d_SD[j]
         return np.asarray(filtered * np.float32(share), dtype=np.float32)

@@ -13,26 +13,33 @@ from tomopose.units import Array
 CIRCULAR_ELEVATION = math.radians(0.5)
 CIRCULAR_ROLL = math.radians(1.0)
 """Up to these a path counts as circular: elevation of the source over its plane, and of detector rows against it."""
+STEEPEST = 1.5
+"""Rise over run up to which a path counts as smooth."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourcePath:
     """axis: (3,) unit normal of the best plane through the sources, in W; centre: (3,) mm, of the circle in it.
 
-    angle: (n,) rad about the axis; weight: (n,) rad, the share of the turn of each view; distance: (n,) mm from source
-    to centre; elevation: (n,) rad over the plane; coverage: rad, the turn that is covered; circular: whether FDK's
-    assumption holds; full_turn: whether no gap stands out.
+    angle: (n,) rad about the axis; weight: (n,) rad, the share of the turn of each view; arm: (n, 3) mm, from centre to
+    source; distance: (n,) mm, its length; elevation: (n,) rad over the plane; tangent: (n, 3) mm/rad, how the source
+    moves with the angle; coverage: rad, the turn that is covered; circular: whether FDK's assumption holds; full_turn:
+    whether no gap stands out; smooth: whether the height is a smooth function of the angle, so that neighbours by angle
+    are neighbours on the way (not on two rings, or with scattered views).
     """
 
     axis: Array
     centre: Array
     angle: Array
     weight: Array
+    arm: Array
     distance: Array
     elevation: Array
+    tangent: Array
     coverage: float
     circular: bool
     full_turn: bool
+    smooth: bool
 
 
 def source_path(matrices: ProjectionMatrices) -> SourcePath:
@@ -66,7 +73,20 @@ def source_path(matrices: ProjectionMatrices) -> SourcePath:
         and bool(np.abs(rows @ axis).max() < math.sin(CIRCULAR_ROLL))
         and bool(spread[1] > 1e-3 * spread[0])
     )
+    slope = np.empty(len(angle))
+    rise = np.roll(elevation[order], -1) - elevation[order]
+    run = np.maximum(gap, 0.1 * typical)  # repeated views have none
+    slope[order] = (rise + np.roll(rise, 1)) / (run + np.roll(run, 1))
     return SourcePath(
-        axis=axis, centre=centre, angle=angle, weight=weight, distance=distance, elevation=elevation,
-        coverage=float(shared.sum()), circular=circular, full_turn=full,
+        axis=axis, centre=centre, angle=angle, weight=weight, arm=arm, distance=distance, elevation=elevation,
+        tangent=tangents(arm, axis, slope), coverage=float(shared.sum()), circular=circular, full_turn=full,
+        smooth=bool((np.abs(rise) < STEEPEST * run).all()),
     )
+
+
+def tangents(arm: Array, axis: Array, slope: Array) -> Array:
+    """(n, 3): d arm / d angle about the axis, where d elevation / d angle is `slope` (n,)."""
+    around = np.cross(axis, arm)
+    across = np.cross(arm, around)
+    up = across / np.linalg.norm(across, axis=1, keepdims=True)
+    return np.asarray(around + (slope * np.linalg.norm(arm, axis=1))[:, None] * up)

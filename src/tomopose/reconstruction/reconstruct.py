@@ -86,7 +86,7 @@ def reconstruct(
                 left out where the sequence says it itself; it is never guessed.
     engine:     "cpu", "reference", "rtk", "astra", or "auto": the GPU where ASTRA finds one, else the CPU.
     algorithm:  "fdk+sart" (default: FDK as a start, then SART), "sart" (from zero; `PAPER` is one iteration at 0.8),
-                "ossart" (subsets of 5 views unless given), "fdk" (refused where the path is no full circle),
+                "ossart" (subsets of 5 views unless given), "fdk" (refused where the path is no full turn, or jumps),
                 "fdk-preview" (FDK on any path, its errors noted), "cgls" (20 iterations unless given).
     relaxation: one factor, or one an iteration, above 0 and below 2.
     iterations: sweeps over all views; 1 unless given (cgls: 20).
@@ -112,7 +112,7 @@ def reconstruct(
     ------
     InputError, ShapeError, ConventionError   for images that cannot be used or contradict the matrices.
     OutOfViewError                            where the grid lies outside the field of view.
-    TrajectoryError                           for "fdk" on a path that is no full circle.
+    TrajectoryError                           for "fdk" on a path that is no full turn, or jumps.
     EngineMissingError                        where the engine cannot run here.
     """
     if algorithm not in ALGORITHMS:
@@ -138,7 +138,7 @@ def reconstruct(
     path = source_path(matrices)
     notes = path_notes(matrices, grid, path)
     if algorithm == "fdk":
-        require_circle(path)
+        require_followed(path)
     agreement = None
     if consistency == "error":
         agreement = require_consistent(scan, grid)
@@ -250,14 +250,12 @@ def path_notes(matrices: ProjectionMatrices, grid: VoxelGrid, path: SourcePath) 
     return notes
 
 
-def require_circle(path: SourcePath) -> None:
-    """TrajectoryError where FDK alone would mislead."""
-    tilt = math.degrees(float(np.abs(path.elevation).max()))
-    if not path.circular:
+def require_followed(path: SourcePath) -> None:
+    """TrajectoryError where filtered back-projection alone would mislead."""
+    if not path.smooth:
         raise TrajectoryError(
-            f"FDK is made for circular paths; here the source leaves its plane by up to {tilt:.2f} degrees, or the "
-            'detector rows do. Use algorithm="fdk+sart", or "fdk-preview" for a quick look',
-            indices=np.flatnonzero(np.abs(path.elevation) > math.radians(0.5)).tolist(),
+            "FDK follows the source's path from view to view about the axis; here its height jumps between neighbours "
+            'by angle (several rings, or scattered views). Use algorithm="fdk+sart", or "fdk-preview" for a quick look'
         )
     if not path.full_turn:
         raise TrajectoryError(

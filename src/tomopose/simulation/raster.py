@@ -208,13 +208,24 @@ def mesh_path_image(
     P = projected([(m.mesh, T_FW[m.frame], 0) for m in meshes], view, (window.u_0, window.v_0)).arrays
     Q, seen = np.zeros((window.n_v, window.n_u, 1)), np.zeros((window.n_v, window.n_u), dtype=np.int64)
     in_bands(lambda lo, hi: fill(P, lo, hi, Q, seen), window.n_v, threads)
-    return np.asarray(Q[:, :, 0] * _reach(view, window))
+    along_u, along_v, twist = _reach(view, window)
+    in_bands(lambda lo, hi: _scale(Q, along_u, along_v, twist, window.v_0, lo, hi), window.n_v, threads)
+    return np.asarray(Q[:, :, 0])
 
 
-def _reach(view: View, window: Window) -> Array:
-    """Lengths (n_v, n_u), mm, of u U + v V + O - s."""
+def _reach(view: View, window: Window) -> tuple[Array, Array, Array]:
+    """along_u (n_u,), along_v (n_v,), twist (n_u,): the square of the length of u U + v V + O - s, mm, is
+    along_u + along_v + v twist."""
     u, v = window.u_0 + np.arange(window.n_u), window.v_0 + np.arange(window.n_v)
     g = view.O - view.source
     U, V = view.U, view.V
-    squares = (g @ g + 2 * (g @ U) * u + (U @ U) * u * u)[None, :] + (2 * (g @ V) * v + (V @ V) * v * v)[:, None]
-    return np.sqrt(squares + 2 * (U @ V) * u[None, :] * v[:, None])
+    return g @ g + 2 * (g @ U) * u + (U @ U) * u * u, 2 * (g @ V) * v + (V @ V) * v * v, 2 * (U @ V) * u
+
+
+@njit(cache=True, nogil=True)
+def _scale(Q: Any, along_u: Any, along_v: Any, twist: Any, v_0: int, j_0: int, j_1: int) -> None:
+    """Sums of q times the length of what q counts, in place, rows j_0 to j_1; most pixels see no mesh."""
+    for j in range(j_0, j_1):
+        for i in range(Q.shape[1]):
+            if Q[j, i, 0] != 0.0:
+                Q[j, i, 0] *= np.sqrt(along_u[i] + along_v[j] + twist[i] * (v_0 + j))

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from tomopose.reconstruction.reconstruct import PAPER
 from tomopose.studies.result import Progress, Scale
 from tomopose.studies.section6_calibrations import GRID, calibrations
 from tomopose.studies.section6_checks import checks_of
 from tomopose.studies.section6_figures import figures_of
 from tomopose.studies.section6_scan import MAGNIFICATION, Numbers, Object, Path, Radiographs, scan_with
-from tomopose.studies.section6_specimen import measure_specimen, reference
-from tomopose.studies.section6_standard import measure_standard
+from tomopose.studies.section6_specimen import reference
 from tomopose.studies.section6_tables import (
     MPE_A_UM,
     MPE_K,
@@ -19,7 +19,7 @@ from tomopose.studies.section6_tables import (
     specimen_rows,
     standard_rows,
 )
-from tomopose.studies.section6_volumes import cases_of, matrices_for, measured
+from tomopose.studies.section6_volumes import Case, cases_of, matrices_for, measured
 from tomopose.studies.steps import Steps
 from tomopose.studies.virtual_hexapod import ball_run, scan_error_um
 from tomopose.trajectory.completeness import source_path
@@ -31,7 +31,7 @@ PLAN: Mapping[Scale, Numbers] = {
     ),
     "paper": Numbers(
         binning={"specimen": 2, "standard": 2}, views={"specimen": 900, "standard": 1000},
-        runs={"specimen": (1, 2), "standard": (1, 2)}, edge=0.25, samples=2, radiographs=True,
+        runs={"specimen": (1,), "standard": (1,)}, edge=0.25, samples=2, radiographs=True,
     ),
 }
 """Binning, views and calibration of table 3 at scale "paper"."""
@@ -74,14 +74,37 @@ NOTES = (
 )
 
 
+def is_compared(case: Case) -> bool:
+    """Whether a volume is one of those that the study was made to set side by side."""
+    if case.path == "circular":
+        return case.method == "best"
+    return case.run > 0 and not case.order
+
+
+def options_of(case: Case) -> dict[str, Any]:
+    """How a volume is reconstructed: as the paper does, or by our best, the ramp filter along the source's path."""
+    if case.method == "paper" or case.order:
+        return {**PAPER, **({"order": case.order} if case.order else {})}
+    return {"algorithm": "fdk"}
+
+
 def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any, Any, Any, Any]:
     """Rows, checks, figures and notes."""
-    return run_with(PLAN[scale], seed, steps, progress)
+    return run_with(PLAN[scale], seed, steps, progress, compared_only=scale == "paper")
 
 
-def run_with(numbers: Numbers, seed: int, steps: Steps, progress: Progress) -> tuple[Any, Any, Any, Any]:
-    """The study at any size between the two scales."""
-    cases = {thing: cases_of(thing, numbers.runs[thing]) for thing in THINGS}
+def run_with(
+    numbers: Numbers, seed: int, steps: Steps, progress: Progress, *, compared_only: bool = False
+) -> tuple[Any, Any, Any, Any]:
+    """The study at any size between the two scales.
+
+    compared_only: leave out what explains the numbers but is not needed for them: the circular scan by the paper's
+    method, the true matrices and the orders of the views.
+    """
+    cases = {
+        thing: [c for c in cases_of(thing, numbers.runs[thing]) if not compared_only or is_compared(c)]
+        for thing in THINGS
+    }
     parts = sum(len(numbers.runs[t]) + len(cases[t]) for t in THINGS)
     done = 0
 
@@ -104,19 +127,18 @@ def run_with(numbers: Numbers, seed: int, steps: Steps, progress: Progress) -> t
             done += 1
         paths: tuple[Path, ...] = ("circular", "3D")
         scans = {path: scan_with(thing, path, numbers, seed) for path in paths}
-        images = {path: Radiographs(scan) for path, scan in scans.items()}
-
-        def measure(volume: Any, thing: Object = thing) -> dict[str, Any]:
-            return measure_specimen(volume, numbers.edge) if thing == "specimen" else measure_standard(volume)
+        images = {path: Radiographs(scan, steps.folder) for path, scan in scans.items()}
 
         for case in cases[thing]:
             scan = scans[case.path]
             found[case.name] = measured(
                 case, scan, images[case.path], lambda c=case, s=scan, d=solved: matrices_for(c, s, d),  # type: ignore[misc]
-                numbers, measure, steps, part,
+                numbers, options_of(case), steps, part,
             )
             done += 1
             part(0, 1)
+        for kept in images.values():
+            kept.forget()
     mesh = reference(numbers.edge)
     source = source_path(scan_with("specimen", "circular", numbers, seed).truth)
     rows = [

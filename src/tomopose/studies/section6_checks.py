@@ -7,7 +7,7 @@ import numpy as np
 from tomopose.measurement.meshes import Mesh
 from tomopose.studies.result import StudyCheck, StudyRow, check_below, check_between
 from tomopose.studies.section6_specimen import azimuth, cylinder_areas
-from tomopose.studies.section6_tables import PERIODS, PRINTED_CYLINDER_UM, Found, deviations, limit, rms, waves
+from tomopose.studies.section6_tables import ORDERS, PERIODS, PRINTED_CYLINDER_UM, Found, deviations, limit, rms, waves
 
 CIRCLE_FACTOR = 1.2
 """How much worse than the circular scan's the cylinder areas may be."""
@@ -31,9 +31,9 @@ def checks_of(rows: list[StudyRow], found: Found, mesh: Mesh, *, strict: bool) -
     part = "cylinder areas, part with seven periods"
 
     def against_circle(statement: str, figure: str, quantity: str, factor: float) -> StudyCheck:
-        ours = of(f"{figure}, {tilted}", quantity, "best")
-        return check_below(f"by our best {statement}", ours / of(f"{figure}, {circle}", quantity, "best"), factor,
-                           "x the circular scan's")
+        ours, there = of(f"{figure}, {tilted}", quantity, "best"), at[f"{figure}, {circle}", quantity]
+        least = min(value for value in (there.paper_method, there.best) if value is not None)
+        return check_below(f"by our best {statement}", ours / least, factor, "x the better circular volume's")
 
     checks = [
         check_between("fig. 12: by the paper's method the cylinder areas' largest deviation is of the printed order",
@@ -51,15 +51,13 @@ def checks_of(rows: list[StudyRow], found: Found, mesh: Mesh, *, strict: bool) -
                        "errors of 351 distances, rms", 1.0),
         against_circle("the 3D scan's diameters are not worse than the circular scan's (fig. 15, scatter)", "Fig. 15",
                        "scatter of 27 diameters", 1.0),
-        StudyCheck(
-            statement="in one iteration of SART views in sequence are worse than in golden order (figs. 14, 16)",
-            found=" against ".join(
-                f"{rms(found[f'standard-3D-best-run1-{o}']['distance_um']):.3g} um" for o in ("sequential", "golden")
-            ),
-            holds=rms(found["standard-3D-best-run1-sequential"]["distance_um"])
-            > rms(found["standard-3D-best-run1-golden"]["distance_um"]),
-        ),
     ]
+    if all(f"standard-3D-best-run1-{order}" in found for order in ORDERS):
+        in_turn, golden = (rms(found[f"standard-3D-best-run1-{order}"]["distance_um"]) for order in ORDERS)
+        checks.append(StudyCheck(
+            statement="in one iteration of SART views in sequence are worse than in golden order (figs. 14, 16)",
+            found=f"{in_turn:.3g} um against {golden:.3g} um", holds=in_turn > golden,
+        ))
     if strict:
         checks += [
             check_below("fig. 14: by our best the 3D scan's 351 distances lie within the MPE",

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path as FilePath
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -22,6 +24,7 @@ from tomopose.simulation.spectrum import tube_spectrum
 from tomopose.simulation.standard import BASE_TOP, SHAFT_DIAMETER, sphere_centres, sphere_diameters
 from tomopose.studies.demo import demo_setup, paper_scanner
 from tomopose.studies.section6_paths import ball_paths, fine_matrices, mesh_paths
+from tomopose.studies.steps import sources
 from tomopose.studies.virtual_hexapod import real_T_MH, scan_of
 from tomopose.trajectory.scan import circular_scan
 from tomopose.units import Array
@@ -39,8 +42,8 @@ MARGIN_MM = 2.0
 """Air around the object in the volume."""
 SNR_UNBINNED, WHITE = 200.0, 50000.0
 """Of an unattenuated pixel before binning, and what it counts."""
-MOST_KEPT_BYTES = 2e8
-"""Frames of smaller scans stay in memory; those of larger ones are made each time anew."""
+MOST_KEPT_BYTES = 6e8
+"""Frames of smaller scans stay in memory; those of larger ones are kept in a file, where there is a folder for it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,15 +145,25 @@ def path_maker(scan: Scan) -> Callable[[int], Array]:
 
 
 class Radiographs(Sequence[Any]):
-    """The frames of a scan, uint16 [v, u], made when they are asked for; the same frame is always the same."""
+    """The frames of a scan, uint16 [v, u], made when they are first asked for; the same frame is always the same.
+
+    folder: where the frames of a large scan are kept between volumes and runs.
+    """
 
     images_are = "counts"
 
-    def __init__(self, scan: Scan) -> None:
+    def __init__(self, scan: Scan, folder: FilePath | None = None) -> None:
         self.scan, self._paths = scan, path_maker(scan)
-        self._kept: dict[int, Any] = {}
         self._mu = attenuation_of(scan.thing)
         self._seeds = np.random.SeedSequence(scan.seed).generate_state(len(scan.poses))
+        shape = (len(scan.poses), scan.truth.n_v, scan.truth.n_u)
+        large = 2 * np.prod(shape) > MOST_KEPT_BYTES
+        self.file = folder / f"frames-{scan.thing}-{scan.path}-{fingerprint(scan)}.npy" if folder and large else None
+        self._kept: Any = None if large else np.zeros(shape, dtype=np.uint16)
+        if self.file is not None:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            mode: Any = "r+" if self.file.exists() else "w+"
+            self._kept = np.lib.format.open_memmap(self.file, mode, dtype=np.uint16, shape=shape)
 
     def __len__(self) -> int:
         return len(self.scan.poses)
@@ -162,12 +175,26 @@ class Radiographs(Sequence[Any]):
         return np.asarray(fine.reshape(n_v, s, n_u, s).mean(axis=(1, 3)))
 
     def __getitem__(self, j: Any) -> Any:
-        if j in self._kept:
+        # A frame counts 1 at least, and its last pixel is written last: 0 there says that it has not been made.
+        if self._kept is not None and self._kept[j, -1, -1]:
             return self._kept[j]
         T = self.transmission(int(j))
         noise = np.random.default_rng(self._seeds[int(j)]).standard_normal(T.shape)
         counts = WHITE * (T + np.sqrt(T) / (SNR_UNBINNED * self.scan.binning) * noise)
         frame = np.clip(np.rint(counts), 1, 65535).astype(np.uint16)
-        if len(self) * frame.nbytes < MOST_KEPT_BYTES:
+        if self._kept is not None:
             self._kept[j] = frame
         return frame
+
+    def forget(self) -> None:
+        """Remove the kept frames: they are not needed any more."""
+        self._kept = None
+        if self.file is not None:
+            self.file.unlink(missing_ok=True)
+
+
+def fingerprint(scan: Scan) -> str:
+    """Of all that a scan's frames depend on."""
+    digest = hashlib.sha256(np.ascontiguousarray(scan.truth.P).tobytes())
+    digest.update(f"{scan.samples} {scan.edge} {scan.seed} {sources(__name__)}".encode())
+    return digest.hexdigest()[:12]

@@ -1,8 +1,15 @@
-"""Intermediate results that survive an interruption: one small JSON file a step, whole or absent."""
+"""Intermediate results that survive an interruption: one small JSON file a step, whole or absent.
+
+A step belongs to the studies' code that made it: its key holds a digest of the module that computes it and of all
+modules of this folder which that one imports.
+"""
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import json
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +20,24 @@ from tomopose.files import plain, read_json, write_json
 from tomopose.provenance import package_version
 
 SCHEMA_NAME = "study-step"
+PACKAGE = "tomopose.studies"
+
+
+@functools.cache
+def sources(module: str) -> str:
+    """SHA-256 over a module of the studies and all of them that it imports, directly or not; empty for any other."""
+    found: dict[str, bytes] = {}
+    left = [module]
+    while left:
+        name = left.pop()
+        path = Path(__file__).with_name(name.rpartition(".")[2] + ".py")
+        if name in found or not name.startswith(PACKAGE + ".") or not path.exists():
+            continue
+        found[name] = path.read_bytes()
+        text = found[name].decode()
+        left += re.findall(r"from (tomopose\.studies\.\w+) import", text)
+        left += [f"{PACKAGE}.{n}" for n in re.findall(r"from tomopose\.studies import (\w+)", text)]
+    return hashlib.sha256(b"".join(found[n] for n in sorted(found))).hexdigest() if found else ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,11 +49,13 @@ class Steps:
     key: Mapping[str, Any] = field(default_factory=dict)
 
     def of(self, name: str, compute: Callable[[], Mapping[str, Any]], **key: Any) -> dict[str, Any]:
-        """The content of a step: kept from an earlier run with the same key, or computed (and kept) now.
+        """The content of a step: kept from an earlier run with the same key and code, or computed (and kept) now.
 
         The content is plain JSON, also where nothing is kept, so that a resumed run gives the same numbers.
         """
-        wanted = json.loads(json.dumps(plain({"version": package_version(), **self.key, **key})))
+        wanted = json.loads(json.dumps(plain({
+            "version": package_version(), "sources": sources(compute.__module__), **self.key, **key,
+        })))
         path = None if self.folder is None else self.folder / f"{name}.json"
         if path is not None and path.exists():
             try:
