@@ -1,12 +1,13 @@
 """The uncertainty of measurands by simulation with the virtual CT (JCGM 101:2008).
 
 Each draw is a whole scan of the nominal object: photon noise of its own, matrices from a calibration drawn from its
-covariance, reconstruction on a grid shifted by up to half a voxel, and measurement by the plan.
+covariance, reconstruction and measurement by the plan.
 
-Nobody knows where within their voxels and pixels the two ends of a length lie against each other.  The draws therefore
-fall into SIZES groups, for which the object is between 2 % smaller and 2 % larger in voxels and pixels: over 25 voxels
-that moves one end through a whole voxel against the other.  It is the scanner with its voxels that is made larger or
-smaller, so that the plan and its nominal values stay.  The noiseless images are made once for each group.
+Nobody knows where within voxels and pixels a part lies, nor its two ends against each other.  In each draw the object
+therefore lies up to half a voxel elsewhere, and is up to 2 % smaller or larger in voxels and pixels: over 25 voxels
+that moves one end by half a voxel against the other.  (Another grid on the same images would not do: how voxels lie to
+the rows of the detector matters too, and is the same in all scans.)  It is the scanner with its voxels that is moved
+and made larger or smaller, so that the plan and its nominal values stay.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ from tomopose.units import Array
 from tomopose.volume import Volume, VoxelGrid
 
 LEAST_DRAWS = 3
-SIZES, SIZE_SPREAD = 5, 0.02
-"""Sizes of the object in voxels over which the draws are shared out, and by which share they differ at most."""
+SIZE_SPREAD = 0.02
+"""Share by which the object is smaller or larger at most, in voxels."""
 POSE_STEPS = 4
 
 
@@ -90,39 +91,37 @@ def virtual_volumes(
     run: SimulatedRun, grid: VoxelGrid, *, draws: int, calibration: Calibration | None = None, seed: int = 0,
     options: Mapping[str, Any] | None = None,
 ) -> Iterator[Volume]:
-    """Reconstructions of the run, each with noise, believed matrices and grid of its own; draw k of as many draws is
+    """Reconstructions of the run, each with noise, place, size in voxels and believed matrices of its own; draw k is
     always the same."""
-    for group in np.array_split(np.arange(draws), min(SIZES, draws)):
-        size = 1 + SIZE_SPREAD * ((group.mean() + 0.5) / draws * 2 - 1)
-        scaled = _scaled(run, size)
-        clean = [signal(scaled, i).astype(np.float32) for i in range(len(run))]
-        for k in group:
-            sequence = np.random.SeedSequence([seed, int(k)])
-            noise, rng = int(sequence.generate_state(1)[0]), np.random.default_rng(sequence)
-            found = drawn_matrices(run, grid, calibration, rng)
-            # What the scanner saw at size times x it sees at x, being so much smaller.
-            matrices = replace(found, P=found.P * [size, size, size, 1.0], p_u=found.p_u / size, p_v=found.p_v / size,
-                               scanner=None if found.scanner is None else _smaller(found.scanner, size))
-            box = replace(grid, centre=(grid.centre + grid.spacing * rng.uniform(-0.5, 0.5, 3)) / size,
-                          spacing=grid.spacing / size)
-            images = [expose(T.astype(np.float64), run.detector, run.scanner, seed=noise, frame=i)
-                      for i, T in enumerate(clean)]
-            white, dark = _levels(run, noise)
-            yield reconstruct(images, matrices, box, images_are="counts", white=white, dark=dark, consistency="off",
-                              **dict(options or {}))
+    for k in range(draws):
+        sequence = np.random.SeedSequence([seed, k])
+        noise, rng = int(sequence.generate_state(1)[0]), np.random.default_rng(sequence)
+        found = drawn_matrices(run, grid, calibration, rng)
+        size = 1 + SIZE_SPREAD * rng.uniform(-1, 1)
+        shift = grid.spacing / size * rng.uniform(-0.5, 0.5, 3)
+        placed = _placed(run, size, shift)
+        # What the scanner saw at size (x + shift) it sees at x, being so much smaller and the object moved.
+        motion = np.diag([size, size, size, 1.0])
+        motion[:3, 3] = size * shift
+        matrices = replace(found, P=found.P @ motion, p_u=found.p_u / size, p_v=found.p_v / size,
+                           scanner=None if found.scanner is None else _smaller(found.scanner, size))
+        box = replace(grid, centre=grid.centre / size - shift, spacing=grid.spacing / size)
+        images = [expose(signal(placed, i), run.detector, run.scanner, seed=noise, frame=i) for i in range(len(run))]
+        white, dark = _levels(run, noise)
+        yield reconstruct(images, matrices, box, images_are="counts", white=white, dark=dark, consistency="off",
+                          **dict(options or {}))
 
 
-def _scaled(run: SimulatedRun, size: float) -> SimulatedRun:
-    """The run on a scanner smaller by `size`, on which the same object is larger by that in pixels."""
-    def smaller(T: RigidTransform) -> RigidTransform:
-        return replace(T, t=T.t / size)
-
-    return replace(run, scanner=_smaller(run.scanner, size), T_HT=smaller(run.T_HT), T_MH=smaller(run.T_MH),
-                   poses=replace(run.poses, T_MH=smaller(run.poses.T_MH)))
+def _placed(run: SimulatedRun, size: float, shift: Array) -> SimulatedRun:
+    """The run on a scanner smaller by `size`, the object of the same size moved by shift (3,), mm along W at home."""
+    shift_M = run.T_HT.R.T @ run.scanner.T_TW(0.0).R.T @ shift
+    T_MH = replace(run.T_MH, t=run.T_MH.t / size + run.T_MH.R @ shift_M)
+    return replace(run, scanner=_smaller(run.scanner, size), T_HT=replace(run.T_HT, t=run.T_HT.t / size), T_MH=T_MH)
 
 
 def _smaller(scanner: Scanner, size: float) -> Scanner:
-    return replace(scanner, **{name: getattr(scanner, name) / size for name in ("d_SD", "d_SR", "p_u", "p_v", "axis_y")})
+    lengths = ("d_SD", "d_SR", "p_u", "p_v", "axis_y")
+    return replace(scanner, **{name: getattr(scanner, name) / size for name in lengths})
 
 
 def _levels(run: SimulatedRun, seed: int) -> tuple[Any, Any]:
