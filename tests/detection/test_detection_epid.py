@@ -19,9 +19,11 @@ RADIUS = 2.5 * 1.5 / 0.784
 CENTRAL = 12
 """The ball lies at the isocentre within a few mm: the search covers so many px either way of the image's middle."""
 TOLERANCE = 0.5
-"""px.  What the independent estimate is worth: its surroundings are one level, while the field's edge runs past the
-ball at 3 radii, and a Laplacian of 2.5 instead of 4 px moves its extremum by up to half a pixel too.  Anything else in
-these images (edge, middle or corner of the field) lies several pixels away."""
+"""px.  What the independent estimate is worth where the couch's edge runs past the ball at less than 2 radii and no
+plane describes the surroundings (gantry at 45, 135, 225 and 315 degrees).  Anything else in these images (edge, middle
+or corner of the field) lies several pixels away."""
+CLEAR, CLEAR_TOLERANCE = 13, 0.05
+"""In so many images nothing else lies near the ball; there half-height crossings are good to so many px."""
 
 
 def brightest_blob(image: Array) -> Array:
@@ -37,15 +39,19 @@ def brightest_blob(image: Array) -> Array:
 
 
 def half_height_centre(image: Array) -> Array:
-    """(u, v) of the circle through the half-height crossings on 72 rays from the blob's peak."""
+    """(u, v) of the circle through the half-height crossings on 72 rays from the blob's peak, above a plane."""
     u, v = brightest_blob(image)
     rows, columns = np.indices(image.shape)
     away = np.hypot(columns - u, rows - v) / RADIUS
-    half = (np.median(image[away < 0.5]) + np.median(image[(away > 1.5) & (away < 1.9)])) / 2
-    distance = np.arange(0.0, 2 * RADIUS, 0.05)
+    ring = (away > 1.35) & (away < 1.7)
+    plane = np.stack([np.ones_like(image), columns - u, rows - v])
+    level = np.linalg.lstsq(plane[:, ring].T, image[ring], rcond=None)[0]
+    above = image - np.tensordot(level, plane, 1)
+    half = np.median(above[away < 0.5]) / 2
+    distance = np.arange(0.0, 1.4 * RADIUS, 0.02)
     rim = []
     for turn in np.radians(np.arange(0, 360, 5)):
-        ray = map_coordinates(image, [v + distance * np.sin(turn), u + distance * np.cos(turn)], order=1)
+        ray = map_coordinates(above, [v + distance * np.sin(turn), u + distance * np.cos(turn)], order=3)
         assert ray.min() < half
         reach = distance[np.argmax(ray < half)]
         rim.append([u + reach * np.cos(turn), v + reach * np.sin(turn)])
@@ -77,9 +83,9 @@ def test_every_ball_is_found_and_none_is_wrong(images: list[Array], observations
     independent = np.array([half_height_centre(np.asarray(image, dtype=np.float64)) for image in images])
     difference = observations.x_D - independent
     assert np.abs(difference).max() < TOLERANCE
-    assert np.abs(np.median(difference, axis=0)).max() < 0.1
+    assert np.sum(np.abs(difference).max(axis=1) < CLEAR_TOLERANCE) >= CLEAR
 
 
 def test_rows_say_what_the_images_are(observations: BallObservations) -> None:
     assert all("bright ball" in s for s in observations.status or ())
-    assert observations.sigma.max() < 0.1
+    assert observations.sigma.max() < 0.2

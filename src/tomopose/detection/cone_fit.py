@@ -19,8 +19,9 @@ from tomopose.detection.cholesky import solve
 from tomopose.detection.cone import ring_pixels
 from tomopose.detection.edges import FIRST_NODE, N_SHAPE, SHAPE, influence
 from tomopose.detection.nested import nearer
-from tomopose.detection.noise import correlation, sandwich, weights
+from tomopose.detection.noise import across, correlation, evident, sandwich, weights
 from tomopose.detection.rim import ENOUGH, STAY, Rim
+from tomopose.detection.sectors import rounder
 from tomopose.errors import BallNotFoundError
 from tomopose.geometry.scanner import Scanner
 from tomopose.units import Array
@@ -34,6 +35,9 @@ STEEPEST = 6.0
 FEW_BENT, BENT = 0.1, 10.0
 """Prior share of nodes where the background is bent, and its curvature there, in variances of the estimate."""
 LEAST_TAU2 = 1e-3
+ENOUGH_QUIET, FEWEST_PIXELS = 200, 60
+"""Pixels in sectors that fit well from which noise is taken from them alone, and pixels below which its correlation
+cannot be told."""
 KAPPA_STARTS = (0.3, 1.0, 3.0, 8.0)
 """Total attenuations along the diameter from which a ball that X-rays pass is fitted; below the first the shape of
 the profile no longer depends on it."""
@@ -135,8 +139,10 @@ def fit_cone(
         rim.step(active, careful=kappa_free)
     noise = _weigh(rim, floor, 2.5)
     rim.polish(active, careful=kappa_free)
-    rho = _noise_correlation(rim, noise)
-    doubt = nearer(rim, active, careful=kappa_free, noise=max(float(rho.sum()), 1.0))
+    rho, apart = _noise_correlation(rim, noise)
+    together = max(float(rho.sum()), 1.0) if apart else 1.0
+    doubt = nearer(rim, active, careful=kappa_free, noise=together)
+    doubt += rounder(rim, active, parameters=2.5, noise=together)
     anisotropy, anisotropy_covariance = _anisotropy(rim, shape)
     significance = float(anisotropy @ np.linalg.solve(anisotropy_covariance, anisotropy))
     if significance > 30.0 and np.hypot(*anisotropy) > 0.1 * rim.shape[3] ** 2:
@@ -145,7 +151,7 @@ def fit_cone(
         for _ in range(3):
             rim.step(active)
         anisotropy = rim.shape[5:7].copy()
-    return _result(rim, shape, active, noise, rho, doubt, anisotropy, anisotropy_covariance)
+    return _result(rim, shape, active, noise, rho, apart, doubt, anisotropy, anisotropy_covariance)
 
 
 def _approach(rim: Rim, spread: float) -> None:
@@ -235,13 +241,18 @@ def _weigh(rim: Rim, floor: float, parameters: float) -> _Noise:
     return _Noise(inside=v_in, outside=v_out, excess=excess, scatter=scatter)
 
 
-def _noise_correlation(rim: Rim, noise: _Noise) -> Array:
-    """Autocorrelation of the noise where the background is fitted well."""
-    well = (noise.excess < MISFIT * noise.scatter)[rim.left]
-    outside = np.flatnonzero((rim.rim[0] > 3 * rim.shape[3]) & (rim.weight > 0) & well)
-    if outside.size <= 200:
-        return np.ones((1, 1))
-    return correlation(rim.u[outside], rim.v[outside], (rim.residual * np.sqrt(rim.weight))[outside])
+def _noise_correlation(rim: Rim, noise: _Noise) -> tuple[Array, bool]:
+    """Autocorrelation of the noise, where the background fits: what is left of an edge is correlated too.
+
+    On a ring too small to tell the two apart (False), what is left counts as noise.
+    """
+    outside = (rim.rim[0] > 3 * rim.shape[3]) & (rim.weight > 0)
+    quiet = outside & (noise.excess < noise.scatter)[rim.left]
+    apart = bool(np.count_nonzero(quiet) > ENOUGH_QUIET)
+    used = np.flatnonzero(quiet if apart else outside)
+    if used.size <= FEWEST_PIXELS:
+        return np.ones((1, 1)), apart
+    return correlation(rim.u[used], rim.v[used], (rim.residual * np.sqrt(rim.weight))[used]), apart
 
 
 def _curvature_precision(rim: Rim, active: npt.NDArray[np.intp]) -> Array:
@@ -288,6 +299,7 @@ def _result(
     active: npt.NDArray[np.intp],
     noise: _Noise,
     rho: Array,
+    apart: bool,
     doubt: Array,
     anisotropy: Array,
     anisotropy_covariance: Array,
@@ -302,10 +314,13 @@ def _result(
     normalised = rim.residual * np.sqrt(rim.weight)
     if np.count_nonzero(rho) > 1:
         effect = influence(rim.jacobian, rim.left, rim.weight, _scattered(rim, active, rows), rim.n_nodes)
-        block = sandwich(rim.u, rim.v, effect, rho)
-    near = (np.abs(s) <= 3 * sigma) & clean
-    chi2_near = float((normalised[near] ** 2).mean()) if near.any() else 1.0
-    block = block * max(chi2_near, 1.0)
+        from_priors = block - effect.T @ effect
+        if apart:
+            effect = effect * across(s, normalised, clean)[:, None]
+        block = sandwich(rim.u, rim.v, effect, rho) + from_priors
+    near = (np.abs(s) <= 3 * sigma) & clean if apart else (s > 0) & (rim.weight > 0)
+    if near.any():
+        block = block * evident(float((normalised[near] ** 2).mean()), float(np.count_nonzero(near)))
     block[:2, :2] += doubt
     all_near = (np.abs(s) <= 3 * sigma) & (rim.weight > 0)
     rim_rms = math.sqrt(float((rim.residual[all_near] ** 2).mean())) if all_near.any() else 0.0

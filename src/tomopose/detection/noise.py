@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 from scipy.ndimage import convolve
 
@@ -12,16 +13,39 @@ from tomopose.units import Array
 
 REACH = 5
 """Lag, px, at which noise no longer counts as correlated: a scintillator's or an interpolation's ends before."""
-SIGNIFICANT = 5.0
+SIGNIFICANT = 3.5
 """Standard deviations by which a neighbour's correlation must differ from 0 before noise counts as correlated."""
 SMALLEST = 0.06
 """Correlation of neighbours below which noise counts as white: a holder leaves some in the residuals too."""
 
 
+LEAK, ENOUGH = 3, 50
+"""Distance from the rim, px, within which noise is measured px by px, and the pixels that this takes."""
 CLIPPED = 0.25
 """Share of the lower quartile below which a sector's variance is that of a saturated background."""
 NORMAL_MEDIAN = 0.455
 """Median of the square of a standard normal variable."""
+KEPT, SHORT = 1.5, 0.139
+"""Standard deviations above their mean up to which sectors' variances count as noise alone, and what that cut takes
+from the mean: phi(1.5) / Phi(1.5)."""
+
+
+RARE = 0.1
+"""Prior share of sets of residuals that hold more than noise."""
+
+
+@njit(cache=True)
+def evident(square, freedom):  # type: ignore[no-untyped-def]
+    """Mean square of so many residuals in standard deviations, brought down to 1 so far as chance may have raised it.
+
+    What is above 1 counts by the probability that there is more than noise: the likelihood ratio at its maximum,
+    times the width that it has in `square`, against the prior odds.
+    """
+    if not square > 1.0:
+        return 1.0
+    chance = (1.0 / RARE - 1.0) * math.sqrt(0.5 * freedom)
+    chance *= math.exp(-0.5 * freedom * (square - 1.0 - math.log(square)))
+    return 1.0 + (square - 1.0) / (1.0 + chance)
 
 
 @njit(cache=True)
@@ -115,8 +139,8 @@ def _quiet(variance, n):  # type: ignore[no-untyped-def]
     spread = max(math.sqrt(2.0 / n), min((quarter - low) / (0.607 * max(quarter, 1e-300)), 0.5))
     middle = quarter * (1.0 + 0.67 * spread)
     for _ in range(4):
-        kept = ordered[ordered < middle * (1.0 + 3.0 * spread)]
-        middle = np.mean(kept)
+        kept = ordered[ordered < middle * (1.0 + KEPT * spread)]
+        middle = np.mean(kept) * (1.0 + SHORT * spread)
     return middle, spread
 
 
@@ -137,9 +161,12 @@ def correlation(u: Array, v: Array, normalised: Array) -> Array:
     rim = np.ones(rho.shape, dtype=bool)
     rim[1:-1, 1:-1] = False
     rho += max(-float(np.average(rho[rim], weights=count[rim])), 0.0)
-    # Autocorrelations of correlated noise vary by sqrt(sum rho^2 / n) themselves.
+    # Autocorrelations of correlated noise vary by sqrt(sum rho^2 / n) themselves; they end where a ring of lags is 0.
     chance = math.sqrt(float((near**2).sum()) / count[REACH, REACH])
-    rho[(np.abs(rho) < 2.0 * chance) | rim] = 0.0
+    lag = np.abs(np.arange(-REACH, REACH + 1))
+    ring = np.maximum(lag[:, None], lag)
+    over = next(r for r in range(2, REACH + 1) if r == REACH or rho[ring == r].mean() < 2.0 * chance / math.sqrt(8 * r))
+    rho[ring >= over] = 0.0
     return rho
 
 
@@ -151,11 +178,29 @@ def _correlation(grid: Array, reach: int) -> tuple[Array, Array]:
 
 
 def sandwich(u: Array, v: Array, influence: Array, rho: Array) -> Array:
-    """Covariance (m, m) of estimates with influence (n, m), in units of a pixel's own noise, under correlation rho."""
+    """Covariance (m, m) of estimates with influence (n, m), in units of a pixel's own noise, under correlation rho.
+
+    In no direction smaller than under white noise: a rho cut off at REACH need not be positive definite.
+    """
     grids = [_grid(u, v, influence[:, k], fill=0.0) for k in range(influence.shape[1])]
     spread = [convolve(grid, rho, mode="constant") for grid in grids]
     out = np.array([[float((a * b).sum()) for b in grids] for a in spread])
-    return (out + out.T) / 2
+    root = np.linalg.cholesky(influence.T @ influence)
+    ratio = np.linalg.solve(root, np.linalg.solve(root, (out + out.T) / 2).T)
+    values, axes = np.linalg.eigh((ratio + ratio.T) / 2)
+    axes = root @ axes
+    return np.asarray((axes * np.maximum(values, 1.0)) @ axes.T)
+
+
+def across(s: Array, normalised: Array, clean: npt.NDArray[np.bool_]) -> Array:
+    """(n,) standard deviation of the noise in what was taken for it, by the distance s from the rim.
+
+    Light that spreads in a scintillator carries the background's noise over the rim, where the level tells of none.
+    """
+    bins = np.clip(np.floor(s), -LEAK - 1, LEAK).astype(np.int64) + LEAK + 1
+    square = np.bincount(bins[clean], normalised[clean] ** 2, 2 * LEAK + 2)
+    count = np.bincount(bins[clean], minlength=2 * LEAK + 2)
+    return np.asarray(np.sqrt(np.where(count > ENOUGH, square / np.maximum(count, 1), 1.0))[bins])
 
 
 def _grid(u: Array, v: Array, values: Array, fill: float = np.nan) -> Array:
