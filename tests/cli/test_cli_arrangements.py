@@ -195,6 +195,9 @@ def test_one_more_number_a_view(gantry, scanner, rng):
     assert calibrate(folder, "fixed", *more) == 3, "a d_SD that is not fixed shows"
     assert calibrate(folder, "free", *more, "--d-sd-sigma-mm", "0.5") == 0
     cal = tp.read_calibration(folder / "free" / "calibration.json")
+    assert calibrate(folder, "links", *more[:4], "--model", "kinematic", "--d-sd-sigma-mm", "0.5") in (0, 3)
+    notes = tp.read_calibration(folder / "links" / "calibration.json").observability.notes
+    assert any("; use a known distance between two balls" in note for note in notes), "the links alone hold the scale"
     views = cal.extra["view_d_SD"]
     found, u = np.array(views["d_SD_mm"]), np.array(views["u_mm"])
     assert views["pose_id"] == list(cal.pose_id)

@@ -175,10 +175,11 @@ def _scale_note(model: ErrorModel, covariance: Array) -> list[str]:
     found = prior * float(length @ covariance @ length) * prior
     if found < KNOWN_SCALE * prior:
         return []
+    cure = "a known distance" if robot is not model else "table angles or a known distance"
     return [
         f"all lengths of the robot together, the ball's offset and the distance to the source are known to "
         f"{np.sqrt(found):.1e} only, from the tolerances of its links: the scale of the scan is as uncertain, whatever "
-        "the poses; use table angles or a known distance between two balls"
+        f"the poses; use {cure} between two balls"
     ]
 
 
