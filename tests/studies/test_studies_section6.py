@@ -23,7 +23,7 @@ from tomopose.studies.section6_paths import ball_paths, fine_matrices, mesh_path
 from tomopose.studies.section6_scan import MOUNTED, WHITE, Numbers, Radiographs, grid_of, scan_with, specimen
 from tomopose.studies.section6_specimen import cylinder_areas, reference, true_lengths, unseen_by_circle
 from tomopose.studies.section6_tables import MPE_A_UM, limit, verdict, waves
-from tomopose.studies.section6_volumes import cases_of
+from tomopose.studies.section6_volumes import NEAR_MM, cases_of, near
 from tomopose.studies.steps import Steps
 from tomopose.trajectory.completeness import source_path
 from tomopose.trajectory.scan import tilted_scan
@@ -93,6 +93,37 @@ def test_radiographs_are_the_same_each_time_and_as_noisy_as_said():
     air = clear == 1.0
     assert np.std(noisy[air] / WHITE) == pytest.approx(1 / (200.0 * 11), rel=0.05)
     assert np.mean(noisy[air] / WHITE) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_kept_frames_are_those_that_are_made(tmp_path, monkeypatch):
+    scan = scan_with("standard", "3D", TINY, 5)
+    made = Radiographs(scan)[2]
+    monkeypatch.setattr("tomopose.studies.section6_scan.MOST_KEPT_BYTES", 1e3)
+    kept = Radiographs(scan, tmp_path)
+    np.testing.assert_array_equal(kept[2], made)
+    again = Radiographs(scan, tmp_path)
+    again.transmission = lambda j: pytest.fail("made again")
+    np.testing.assert_array_equal(again[2], made)
+    assert Radiographs(replace(scan, seed=scan.seed + 1), tmp_path).file != again.file
+    again.forget()
+    assert not again.file.exists()
+
+
+@pytest.mark.parametrize("thing", ["specimen", "standard"])
+def test_only_voxels_near_the_object_are_found_by_fdk(thing):
+    grid = grid_of(thing, TINY)
+    mask = near(thing, grid, TINY.edge)
+    x = specimen(TINY.edge).vertices @ MOUNTED.T if thing == "specimen" else sphere_centres()
+    i = np.rint(grid.indices(x)).astype(int)
+    assert mask[tuple(i.T)].all()
+    assert mask.mean() < 0.6
+    if thing == "standard":
+        away = np.flatnonzero(mask)
+        z, y, x = (v.astype(float) for v in np.unravel_index(away, mask.shape))
+        points = grid.origin + grid.spacing * np.column_stack([x, y, z])
+        c = sphere_centres()
+        across = np.hypot(points[:, None, 0] - c[:, 0], points[:, None, 1] - c[:, 1])
+        assert (across.min(axis=1) < 2.5 + NEAR_MM).all()
 
 
 @pytest.mark.parametrize("thing", ["specimen", "standard"])

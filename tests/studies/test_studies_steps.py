@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tomopose.studies.steps import Steps
+from tomopose.studies.steps import Steps, sources
 
 
 def test_a_kept_step_is_not_computed_again_and_gives_the_same_numbers(tmp_path):
@@ -31,3 +31,35 @@ def test_half_a_file_is_computed_anew(tmp_path):
     (tmp_path / "one.json").write_text('{"schema": "tomopose/study-step/1", "key":')
     assert steps.of("one", lambda: {"x": 4}) == {"x": 4}
     assert Steps(folder=tmp_path).of("one", lambda: {"x": 5}) == {"x": 4}
+
+
+def test_a_step_of_other_code_is_computed_anew(tmp_path, monkeypatch):
+    def compute():
+        return {"x": 1}
+
+    compute.__module__ = "tomopose.studies.tuy"
+    assert Steps(folder=tmp_path).of("one", compute) == {"x": 1}
+    monkeypatch.setattr("tomopose.studies.steps.sources", lambda module: "other")
+    assert Steps(folder=tmp_path).of("one", lambda: {"x": 2}) == {"x": 2}
+
+
+def test_sources_are_those_that_a_module_imports(monkeypatch, tmp_path):
+    (tmp_path / "a.py").write_text("from tomopose.studies.b import f\n")
+    (tmp_path / "b.py").write_text("from tomopose.studies import c\n")
+    (tmp_path / "c.py").write_text("x = 1\n")
+    (tmp_path / "d.py").write_text("y = 1\n")
+    monkeypatch.setattr("tomopose.studies.steps.__file__", str(tmp_path / "steps.py"))
+
+    def digest():
+        sources.cache_clear()
+        return sources("tomopose.studies.a")
+
+    try:
+        first = digest()
+        (tmp_path / "d.py").write_text("y = 2\n")
+        assert digest() == first != ""
+        (tmp_path / "c.py").write_text("x = 2\n")
+        assert digest() != first
+        assert sources("numpy.linalg") == ""
+    finally:
+        sources.cache_clear()
