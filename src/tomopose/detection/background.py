@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
+from tomopose.detection.order import median
 from tomopose.detection.rim import STAY, Rim
 
 GROSS = 0.1
@@ -12,6 +14,23 @@ LINE = 6
 """Pixels with gross residuals from which a row or column may be a dead one."""
 MOST_LINES = 6
 """Times that dead lines are looked for."""
+
+
+@njit(cache=True)
+def without_outliers(s, image, value, clear, least, weight):  # type: ignore[no-untyped-def]
+    """(n,) the same weight for all pixels but those farther than `clear` from the rim that are outliers, by `least` at
+    least and 8 standard deviations."""
+    size, m = np.empty(s.shape[0]), 0
+    for i in range(s.shape[0]):
+        if abs(s[i]) > clear:
+            size[m] = abs(image[i] - value[i])
+            m += 1
+    most = max(8 * 1.4826 * median(size, m), least) if m > 0 else np.inf
+    out = np.full(s.shape[0], weight)
+    for i in range(s.shape[0]):
+        if abs(s[i]) > clear and abs(image[i] - value[i]) > most:
+            out[i] = 0.0
+    return out
 
 
 def whole_ring(rim: Rim, spread: float) -> None:

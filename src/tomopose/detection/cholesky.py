@@ -22,53 +22,51 @@ def solve(N: Array, B: Array) -> Array:
     return np.asarray(X)
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"})
+@njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
 def _solve(N, B):  # type: ignore[no-untyped-def]
+    """(whether N is positive definite, X).
+
+    The last unknown is eliminated first: angular nodes that know only their neighbours come before the shape that all
+    know, and a row of the factor is empty before the first entry of its row of N.
+    """
     n, m = B.shape
-    scale = np.empty(n)
+    scale, per_diagonal = np.zeros(n), np.empty(n)
     for i in range(n):
-        scale[i] = 1.0 / math.sqrt(N[n - 1 - i, n - 1 - i]) if N[n - 1 - i, n - 1 - i] > 0.0 else 0.0
-    # The last unknown is eliminated first: angular nodes that know only their neighbours come before the shape that
-    # all know, and a row of the factor is empty before the first entry of its row of N.
-    L = np.zeros((n, n))
-    first = np.empty(n, np.int64)
+        if N[n - 1 - i, n - 1 - i] > 0.0:
+            scale[i] = 1.0 / math.sqrt(N[n - 1 - i, n - 1 - i])
+    L, first = np.empty((n, n)), np.empty(n, np.int64)
     for i in range(n):
-        first[i] = i
-        for j in range(i):
-            if N[n - 1 - i, n - 1 - j] != 0.0:
-                first[i] = j
-                break
-        for j in range(first[i], i + 1):
-            total = N[n - 1 - i, n - 1 - j] * scale[i] * scale[j]
-            if i == j:
-                total = 1.0 + RIDGE if scale[i] > 0.0 else 1.0
-            for k in range(max(first[i], first[j]), j):
+        row = N[n - 1 - i]
+        start = 0
+        while start < i and row[n - 1 - start] == 0.0:
+            start += 1
+        first[i] = start
+        for j in range(start, i):
+            total = row[n - 1 - j] * scale[i] * scale[j]
+            for k in range(max(start, first[j]), j):
                 total -= L[i, k] * L[j, k]
-            if i == j:
-                if not total > 0.0:
-                    return False, B
-                L[i, i] = math.sqrt(total)
-            else:
-                L[i, j] = total / L[j, j]
+            L[i, j] = total * per_diagonal[j]
+        total = 1.0 + RIDGE if scale[i] > 0.0 else 1.0
+        for k in range(start, i):
+            total -= L[i, k] * L[i, k]
+        if not total > 0.0:
+            return False, B
+        per_diagonal[i] = 1.0 / math.sqrt(total)
     X = np.empty((n, m))
     for i in range(n):
         for c in range(m):
             X[i, c] = B[n - 1 - i, c] * scale[i]
         for k in range(first[i], i):
-            f = L[i, k]
-            if f != 0.0:
-                for c in range(m):
-                    X[i, c] -= f * X[k, c]
+            for c in range(m):
+                X[i, c] -= L[i, k] * X[k, c]
         for c in range(m):
-            X[i, c] /= L[i, i]
+            X[i, c] *= per_diagonal[i]
     for i in range(n - 1, -1, -1):
         for c in range(m):
-            X[i, c] /= L[i, i]
+            X[i, c] *= per_diagonal[i]
         for k in range(first[i], i):
-            f = L[i, k]
-            if f != 0.0:
-                for c in range(m):
-                    X[k, c] -= f * X[i, c]
+            for c in range(m):
+                X[k, c] -= L[i, k] * X[i, c]
     for i in range(n):
         for c in range(m):
             X[i, c] *= scale[i]

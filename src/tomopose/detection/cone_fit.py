@@ -13,13 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
-from tomopose.detection.background import MOST_LINES, whole_ring, without_worst_lines
+from tomopose.detection.background import MOST_LINES, whole_ring, without_outliers, without_worst_lines
 from tomopose.detection.cholesky import solve
 from tomopose.detection.cone import ring_pixels
 from tomopose.detection.edges import FIRST_NODE, N_SHAPE, SHAPE, influence
 from tomopose.detection.nested import nearer
 from tomopose.detection.noise import across, correlation, evident, sandwich, weights
+from tomopose.detection.order import median
 from tomopose.detection.rim import ENOUGH, STAY, Rim
 from tomopose.detection.sectors import rounder
 from tomopose.errors import BallNotFoundError
@@ -53,7 +55,8 @@ class ConeFit:
     chi2_dof: with the noise of the background; rho: autocorrelation of the noise.
     visible: share of the rim with pixels; lost: share of the visible rim's pixels left out as bad or outlying;
     rim_rms: residual on the rim, in the image's values.
-    misfit: share of the rim where a holder's edge makes the background outside fit badly.
+    misfit: share of the rim where a holder's edge makes the background outside fit badly; doubt: share of the centre's
+    variance that comes from such edges (nested.py, sectors.py).
     """
 
     shape: Array
@@ -68,6 +71,7 @@ class ConeFit:
     visible: float
     lost: float
     misfit: float
+    doubt: float
     rim_rms: float
     anisotropy: Array
     anisotropy_covariance: Array
@@ -141,6 +145,7 @@ def fit_cone(
     rim.polish(active, careful=kappa_free)
     rho, apart = _noise_correlation(rim, noise)
     together = max(float(rho.sum()), 1.0) if apart else 1.0
+    rim.turn()
     doubt = nearer(rim, active, careful=kappa_free, noise=together)
     doubt += rounder(rim, active, parameters=2.5, noise=together)
     anisotropy, anisotropy_covariance = _anisotropy(rim, shape)
@@ -170,10 +175,9 @@ def _approach(rim: Rim, spread: float) -> None:
         if turn in (1, 3, 6, 9) and moved > 0.02:
             rim.gather()
             rim.evaluate(STAY)
-        away = np.abs(rim.rim[0]) > 3.0 + 2 * moved
-        scale = 1.4826 * float(np.median(np.abs(rim.residual[away]))) if away.any() else 0.0
-        out = away & (np.abs(rim.residual) > max(8 * scale, 0.1 * spread))
-        rim.weight = np.where(out, 0.0, 1.0 / (0.03 * spread) ** 2)
+        rim.weight = without_outliers(
+            rim.rim[0], rim.value, rim.model, 3.0 + 2 * moved, 0.1 * spread, 1.0 / (0.03 * spread) ** 2
+        )
 
 
 def _is_transparent(rim: Rim) -> bool:
@@ -192,10 +196,17 @@ def _is_transparent(rim: Rim) -> bool:
         )  # fmt: skip
         if value.size < 5:
             return False
-        m = float(np.median(value))
-        middle.append((m, 1.8 * float(np.median(np.abs(value - m))) / math.sqrt(value.size)))
+        middle.append(middle_value(value))
     (near, u_near), (deep, u_deep) = middle
     return abs(near - deep) > max(0.01 * abs(rim.level - deep), 6 * math.hypot(u_near, u_deep))
+
+
+@njit(cache=True)
+def middle_value(values):  # type: ignore[no-untyped-def]
+    """Median of the values, and its standard deviation."""
+    n = values.shape[0]
+    middle = median(values.copy(), n)
+    return middle, 1.8 * median(np.abs(values - middle), n) / math.sqrt(n)
 
 
 def _choose_kappa(rim: Rim, spread: float, start: Array) -> None:
@@ -283,7 +294,6 @@ def _curvature_precision(rim: Rim, active: npt.NDArray[np.intp]) -> Array:
 def _anisotropy(rim: Rim, shape: tuple[str, ...]) -> tuple[Array, Array]:
     """One Gauss-Newton step towards a blur that depends on direction, and its covariance, px^2."""
     active = rim.active(*shape, "q_cos", "q_sin")
-    rim.turned, rim._sums = True, None
     N, g = rim.normal(active)
     at = np.searchsorted(active, [SHAPE.index(q) for q in ("q_cos", "q_sin")])
     right = np.zeros((active.size, 3))
@@ -342,6 +352,7 @@ def _result(
         lost=lost,
         rim_rms=rim_rms,
         misfit=float((noise.excess >= MISFIT * noise.scatter).mean()),
+        doubt=float(np.trace(doubt) / np.trace(block[:2, :2])),
         anisotropy=anisotropy,
         anisotropy_covariance=anisotropy_covariance,
     )

@@ -50,6 +50,7 @@ def nearer(rim: Rim, active: npt.NDArray[np.intp], *, careful: bool, noise: floa
             break
         chosen -= 1
     if chosen == len(sizes) - 1:
+        rim.keep(N, g)
         return np.zeros((2, 2))
     rim.use_shells(sizes[chosen])
     rim.polish(active, careful=careful)
@@ -59,6 +60,6 @@ def nearer(rim: Rim, active: npt.NDArray[np.intp], *, careful: bool, noise: floa
 
 def _chi2(D: Array, C: Array) -> float:
     """Of D (2,) with covariance C, by its degrees of freedom; 0 where C is not positive."""
-    if not (C[0, 0] > 0 and C[0, 0] * C[1, 1] > C[0, 1] ** 2):
-        return 0.0
-    return float(D @ np.linalg.solve(C, D)) / 2
+    (x, y), ((xx, xy), (_, yy)) = D.tolist(), C.tolist()
+    determinant = xx * yy - xy * xy
+    return (yy * x * x - 2 * xy * x * y + xx * y * y) / determinant / 2 if xx > 0 and determinant > 0 else 0.0

@@ -68,13 +68,15 @@ def gradient(image, value, jacobian, first, weight, columns, high):  # type: ign
     """g alone of normal_equations, of the shells before `high`."""
     k = (first.shape[0] - 1) // SHELLS
     g = np.zeros(FIRST_NODE + 3 * k)
+    residual = weight * (image - value)
     for node in range(k):
         start, stop = first[node * SHELLS], first[node * SHELLS + high]
-        for i_p in range(columns.shape[0]):
-            p = columns[i_p]
+        y = residual[start:stop]
+        for p in columns:
+            a = jacobian[p, start:stop]
             total = 0.0
-            for i in range(start, stop):
-                total += jacobian[p, i] * weight[i] * (image[i] - value[i])
+            for i in range(stop - start):
+                total += a[i] * y[i]
             g[_place(p, node, k)] += total
     return g
 

@@ -155,22 +155,36 @@ class Rim:
         """Rows of the Jacobian that count in a shell: far from the rim an edge's width and height do not."""
         return _columns(self._opaque(), self.turned, self.linear, shell > 0 and self._ends_near())
 
-    def shell_sums(self, low: int, high: int) -> tuple[Array, Array]:
+    def shell_sums(self, low: int, high: int, weight: Array | None = None) -> tuple[Array, Array]:
         """Normal matrix and right side of all parameters, without priors, of the shells from low to before high."""
         N, g = normal_equations(
-            self.value, self.model, self.jacobian, self.bounds, self.weight, self.columns(low), low, high
-        )
+            self.value, self.model, self.jacobian, self.bounds, self.weight if weight is None else weight,
+            self.columns(low), low, high,
+        )  # fmt: skip
+        return N, g
+
+    def sums_with(self, weight: Array) -> tuple[Array, Array]:
+        """Normal matrix and right side without priors, of pixels with these weights."""
+        N, g = self.shell_sums(0, 1, weight)
+        if self.shells > 1 and self.bounds[-1] > 0:
+            N_far, g_far = self.shell_sums(1, self.shells, weight)
+            N, g = N + N_far, g + g_far
         return N, g
 
     def sums(self) -> tuple[Array, Array]:
-        """Normal matrix and right side without priors; kept until the model or a weight changes."""
+        """sums_with the rim's own weights; kept until the model or the weights change."""
         if self._sums is None or self._sums[0] is not self.weight:
-            N, g = self.shell_sums(0, 1)
-            if self.shells > 1 and self.bounds[-1] > 0:
-                N_far, g_far = self.shell_sums(1, self.shells)
-                N, g = N + N_far, g + g_far
-            self._sums = (self.weight, N, g)
+            self.keep(*self.sums_with(self.weight))
+        assert self._sums is not None
         return self._sums[1], self._sums[2]
+
+    def keep(self, N: Array, g: Array) -> None:
+        """Takes these for the sums at the present model and weights."""
+        self._sums = (self.weight, N, g)
+
+    def turn(self) -> None:
+        """Lets the blur depend on direction from here on."""
+        self.turned, self._sums = True, None
 
     def normal(self, active: npt.NDArray[np.intp]) -> tuple[Array, Array]:
         """Normal matrix and right side of the active parameters, priors included."""
@@ -193,7 +207,7 @@ class Rim:
                 g = gradient(
                     self.value, self.model, self.jacobian, self.bounds, self.weight, self.columns(0), self.shells
                 )
-                self._sums = (self.weight, N, g)
+                self.keep(N, g)
 
     def step(self, active: npt.NDArray[np.intp], *, careful: bool = False) -> float:
         """One Gauss-Newton step, shortened while it makes the fit worse if `careful`.

@@ -41,25 +41,24 @@ def rounder(rim: Rim, active: npt.NDArray[np.intp], *, parameters: float, noise:
     parameters: linear ones that a sector's pixels determine.  noise: variance of a sum of pixels over that of as many
     independent ones.
     """
-    weight, residual = rim.weight, rim.residual
+    residual = rim.residual
 
-    def second(residual: Array) -> Array:
-        """Gives the sectors the weight that these residuals leave them."""
-        share = trust(rim.rim[0], rim.left, rim.share, residual, weight, rim.n_nodes, parameters, noise)
-        rim.weight = weight * share[rim.left]
-        return np.asarray(share)
+    def kept(residual: Array) -> Array:
+        """Share of its weight that these residuals leave each sector."""
+        return np.asarray(
+            trust(rim.rim[0], rim.left, rim.share, residual, rim.weight, rim.n_nodes, parameters, noise)
+        )
 
-    if second(residual).min() > TRUSTED:
-        rim.weight = weight
+    share = kept(residual)
+    if share.min() > TRUSTED:
         return np.zeros((2, 2))
     unit, step = np.eye(active.size, 3), np.zeros(FIRST_NODE + 3 * rim.n_nodes)
     for turn in range(TURNS):
         if turn > 0:
-            second(residual - changes(rim.jacobian, rim.left, step, rim.n_nodes))
-        N, unit[:, 2] = rim.normal(active)
+            share = kept(residual - changes(rim.jacobian, rim.left, step, rim.n_nodes))
+        N, unit[:, 2] = rim.with_priors(*rim.sums_with(rim.weight * share[rim.left]), active)
         X = solve(N, unit)
         step[active] = X[:, 2]
-    rim.weight = weight
     first = solve(rim.normal(active)[0], unit[:, :2])[:2]
     D, V = X[:2, 2], noise * (X[:2, :2] - first)
     values, axes = np.linalg.eigh((V + V.T) / 2 + NEGLIGIBLE * noise * (first + first.T) / 2)
