@@ -67,6 +67,21 @@ def crossings(path: SourcePath, axes: Array) -> np.ndarray:
     return out
 
 
+def panel_frequencies(
+    n: tuple[int, int], p: tuple[float, float], length: int, t: Array
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """k_u (m,) and k_v (h, 1), 1/mm, of a padded image's half spectrum, and each k's direction (h, m) in `crossings`.
+
+    h leaves room for a line across all `n` columns along the steepest direction t (views, 2), which must not wrap.
+    """
+    steepest = min(float(np.max(np.abs(t[:, 1]) / np.maximum(np.abs(t[:, 0]), 1e-6))), 1.0)
+    height = int(scipy.fft.next_fast_len(math.ceil((1 + steepest) * n[1]), real=True))
+    k_u = scipy.fft.rfftfreq(length, p[0]).astype(np.float32)
+    k_v = scipy.fft.fftfreq(height, p[1]).astype(np.float32)[:, None]
+    direction = np.rint(np.arctan2(k_v, k_u) * (DIRECTIONS / np.pi)).astype(np.int16) % DIRECTIONS
+    return k_u, k_v, direction
+
+
 class FdkFilter:
     """Weights and filters single views, ready for back-projection with weight "inverse-square"."""
 
@@ -82,6 +97,9 @@ class FdkFilter:
             axes /= np.linalg.norm(axes, axis=2, keepdims=True)
             self._crossings = crossings(path, axes)
             self._t = np.einsum("jab,jb->ja", axes, path.tangent) / path.distance[:, None]
+            self._panel = panel_frequencies(self._n, self._p, self._ramp.length, self._t)
+            # The band-limited ramp differs from k near 0, where it keeps a wide object's level.
+            self._beyond_k = np.append(self._ramp.transfer - self._panel[0], np.float32(0))
 
     def cosine(self, j: int) -> Array:
         """(n_v, n_u): d_SD over the length of each pixel's ray, view j."""
@@ -97,20 +115,13 @@ class FdkFilter:
         return np.asarray(scipy.fft.irfft(spectrum, n=self._ramp.length, axis=1, workers=self._threads))
 
     def along_path(self, image: np.ndarray, j: int) -> np.ndarray:
-        """The ramp along the path's direction in view j, each k over how often it is known."""
-        t_u, t_v = self._t[j]
-        # Along v a line of slope t_v / t_u through the whole of a row must not wrap around.
-        room = 1 + min(abs(t_v / t_u) if t_u else 1.0, 1.0)
-        size = int(scipy.fft.next_fast_len(math.ceil(room * self._n[1]), real=True)), self._ramp.length
-        k_u = scipy.fft.rfftfreq(size[1], self._p[0]).astype(np.float32)
-        k_v = scipy.fft.fftfreq(size[0], self._p[1]).astype(np.float32)[:, None]
-        k = np.abs(np.float32(t_u) * k_u + np.float32(t_v) * k_v)
-        # The band-limited ramp differs from k near 0, where it keeps a wide object's level.
-        transfer = np.interp(k, k_u, self._ramp.transfer).astype(np.float32) + np.maximum(k - k_u[-1], 0)
-        psi = np.arctan2(k_v, k_u) * np.float32(DIRECTIONS / np.pi)
-        transfer *= 2 / self._crossings[j][np.rint(psi).astype(np.int16) % DIRECTIONS]
+        """The ramp along the path's direction in view j, each k over how often it is met."""
+        (t_u, t_v), (k_u, k_v, direction) = self._t[j].astype(np.float32), self._panel
+        k = np.abs(t_u * k_u + t_v * k_v)
+        more = self._beyond_k[np.minimum(np.rint(k / k_u[1]).astype(np.int32), len(self._beyond_k) - 1)]
+        size = len(k_v), self._ramp.length
         spectrum = scipy.fft.rfft2(image, s=size, workers=self._threads)
-        spectrum *= transfer
+        spectrum *= (k + more) * (2 / self._crossings[j])[direction]
         return np.asarray(scipy.fft.irfft2(spectrum, s=size, workers=self._threads))
 
     def __call__(self, image: np.ndarray, j: int) -> np.ndarray:
