@@ -70,7 +70,7 @@ def files(folder: Path, images: list[np.ndarray]) -> list[Path]:
 
 
 def test_truncated_file(scene: Scene, good: np.ndarray, tmp_path: Path) -> None:
-    """A file that is cut short is named on opening; one that shrinks afterwards is one bad row."""
+    """A file that is cut short is named on opening; one that shrinks afterwards is one bad row, two are too many."""
     paths = files(tmp_path, [good] * 3)
     images = tp.open_images(tmp_path, scene.scanner)
     paths[1].write_bytes(paths[1].read_bytes()[:4000])
@@ -78,6 +78,9 @@ def test_truncated_file(scene: Scene, good: np.ndarray, tmp_path: Path) -> None:
     assert observations.seen.tolist() == [True, False, True]
     assert (observations.status or ())[1].startswith("bad image: ")
     assert "pose_1.tif" in (observations.status or ())[1]
+    paths[2].write_bytes(b"")
+    with pytest.raises(InputError, match=r"2 of 3 images are unusable; the first, pose_1\.tif"):
+        detect(images, scene.scanner, ball_diameter=2 * scene.radius)
     with pytest.raises(FileError, match=r"pose_1\.tif"):
         tp.open_images(tmp_path, scene.scanner)
 
@@ -103,10 +106,9 @@ def test_colour_image_is_refused(scene: Scene, good: np.ndarray) -> None:
 
 
 def test_mixed_shapes_and_types(scene: Scene, good: np.ndarray, tmp_path: Path) -> None:
-    """Arrays are refused one by one, files by the name of the first that differs."""
-    other = detect([good, good[:200], good], scene.scanner, ball_diameter=2 * scene.radius)
-    assert other.seen.tolist() == [True, False, True]
-    assert "297" in (other.status or ())[1]
+    """The first that differs is named."""
+    with pytest.raises(ShapeError, match=r"image 1 has shape \(200, 320\).*the first \(0\) \(297, 320\)"):
+        detect([good, good[:200], good], scene.scanner, ball_diameter=2 * scene.radius)
     files(tmp_path, [good, good.astype(np.float32)])
     with pytest.raises(InputError, match=r"pose_1\.tif"):
         tp.open_images(tmp_path, scene.scanner)
@@ -115,6 +117,8 @@ def test_mixed_shapes_and_types(scene: Scene, good: np.ndarray, tmp_path: Path) 
 def test_exchanged_bytes_are_no_ball(scene: Scene, good: np.ndarray) -> None:
     with pytest.raises(DetectionError):
         found_in(good.byteswap(), scene)
+    with pytest.raises(InputError, match="bytes are exchanged"):
+        detect([good.byteswap()] * 2, scene.scanner, ball_diameter=2 * scene.radius)
 
 
 def test_inverted_contrast(scene: Scene, good: np.ndarray) -> None:
@@ -182,6 +186,7 @@ def test_dead_lines_that_no_mask_names(scene: Scene, clean: Array, line: str) ->
         found = found_in(raw, scene)
         d = found.x_D - scene.x_D
         errors.append(d @ np.linalg.solve(found.covariance, d) / 2)
+        assert "bad pixels on the rim" in found.flags
     assert np.mean(errors) < 2.5
 
 
@@ -228,10 +233,13 @@ def test_glue_inside_the_ring(scene: Scene, clean: Array) -> None:
     lump = gaussian_filter((np.hypot(u - 186.0, v - 178.0) < 13.0).astype(float), 0.7)
     plain = found_in(counts(clean), scene)
     errors = []
+    flags: list[str] = []
     for seed in range(6):
         found = found_in(counts(clean * np.exp(-0.25 * lump), seed=seed), scene)
+        flags += found.flags
         d = found.x_D - scene.x_D
         errors.append(d @ np.linalg.solve(found.covariance, d) / 2)
+    assert flags.count("edge at the rim") >= 4
     assert np.trace(found.covariance) > np.trace(plain.covariance)
     assert np.linalg.norm(d) < 0.02
     assert np.mean(errors) < 4.0
@@ -241,6 +249,17 @@ def test_diameter_off_nominal(scene: Scene, good: np.ndarray) -> None:
     found = found_in(good, scene, ball_diameter=3 * scene.radius)
     assert_right(found, scene)
     assert found.flags == ("radius off nominal",)
+
+
+def test_diameter_that_no_image_of_a_run_shows(scene: Scene, clean: Array) -> None:
+    """By more than 2 % beyond what the run's own magnifications explain: a word; by more than 20 %: an error."""
+    images = [counts(clean, seed=seed) for seed in range(5)]
+    right = detect(images, scene.scanner, ball_diameter=2 * scene.radius)
+    assert set(right.status or ()) == {"ok"}
+    larger = detect(images, scene.scanner, ball_diameter=2.06 * scene.radius)
+    assert set(larger.status or ()) == {"radius off nominal"}
+    with pytest.raises(InputError, match="d_SD, d_SR, a pixel pitch or the diameter is wrong"):
+        detect(images, scene.scanner, ball_diameter=2.6 * scene.radius)
 
 
 def test_ball_that_slips_is_measured_where_it_is(scene: Scene) -> None:
@@ -282,10 +301,12 @@ def test_cropped_image_without_its_place(scene: Scene, good: np.ndarray) -> None
 
 
 def test_exchanged_pixel_pitches() -> None:
-    """On a panel whose pixels are not square the silhouette is no circle of the declared pitches: refused."""
+    """On a panel whose pixels are not square the silhouette is no circle of the declared pitches: named in a run."""
     scene = scene_of(radius_px=40.0, u=150.3, v=160.6, n=N, pitch=(0.2, 0.26))
     image = counts(frame(scene))
     assert_right(found_in(image, scene), scene)
     exchanged = replace(scene.scanner, p_u=0.26, p_v=0.2)
     with pytest.raises(DetectionError):
         detect_image(image, exchanged, ball_diameter=2 * scene.radius)
+    with pytest.raises(InputError, match=r"p_u = 0\.26 mm and p_v = 0\.2 mm are exchanged"):
+        detect([image], exchanged, ball_diameter=2 * scene.radius)

@@ -95,17 +95,26 @@ def test_cropped_images(run: tuple[Scanner, list[np.ndarray], np.ndarray]) -> No
 
 def test_one_bad_image_is_one_bad_row(run: tuple[Scanner, list[np.ndarray], np.ndarray]) -> None:
     scanner, images, _ = run
-    colour = np.stack([images[0]] * 3, axis=-1)
-    bad = [images[0], colour, images[1], images[2][:100], np.zeros_like(images[0]), images[3],
-           images[0].astype(complex), images[4]]  # fmt: skip
+    bad = [*images[:2], np.zeros_like(images[0]), images[3], images[0].byteswap(), images[4]]
     seen = detect(bad, scanner)
-    assert seen.seen.tolist() == [True, False, True, False, False, True, False, True]
-    assert np.isnan(seen.x_D[1]).all()
-    reasons = np.array(seen.status)[~seen.seen]
-    assert [r.split(":")[0] for r in reasons] == ["bad image", "bad image", "not found", "bad image"]
-    assert "colour" in reasons[0]
-    assert "origin=(u, v)" in reasons[1]
-    assert "complex" in reasons[3]
+    assert seen.seen.tolist() == [True, True, False, True, False, True]
+    assert np.isnan(seen.x_D[2]).all()
+    assert [r.split(":")[0] for r in np.array(seen.status)[~seen.seen]] == ["not found", "bad image"]
+    assert "bytes are exchanged" in (seen.status or ())[4]
+    with pytest.raises(InputError, match="2 of 7 images are unusable; the first, 4: each pixel's two bytes"):
+        detect([*bad, images[1].byteswap()], scanner)
+
+
+def test_images_of_one_run_have_one_form(run: tuple[Scanner, list[np.ndarray], np.ndarray]) -> None:
+    scanner, images, _ = run
+    with pytest.raises(ShapeError, match=r"image 1 has shape \(233, 256, 3\).*colour"):
+        detect([images[0], np.stack([images[0]] * 3, axis=-1), images[1]], scanner)
+    with pytest.raises(ShapeError, match=r"image 2 has shape \(100, 256\)"):
+        detect([*images[:2], images[2][:100]], scanner)
+    with pytest.raises(InputError, match=r"image 1 .* of complex128, the first .* of uint16"):
+        detect([images[0], images[1].astype(complex)], scanner)
+    crops = [images[0][20:230, 10:240], images[1][20:220, 10:250]]
+    assert detect(crops, scanner, origin=[(10, 20), (10, 20)]).seen.all()  # type: ignore[arg-type]
 
 
 def test_a_fault_of_all_images_is_an_error(run: tuple[Scanner, list[np.ndarray], np.ndarray]) -> None:

@@ -10,32 +10,33 @@ from typing import Any
 
 import numpy as np
 
+from tomopose.detection.diagnosis import fault_of_input
 from tomopose.detection.executors import ordered_map
-from tomopose.detection.flags import MOTION, motion_length
+from tomopose.detection.flags import MOTION, expected_radius, motion_length
 from tomopose.detection.image import detect_image
 from tomopose.detection.journal import append, fingerprint, read_journal
 from tomopose.detection.lag import ghost_share
 from tomopose.detection.result import BallImage
+from tomopose.detection.whole_run import (
+    NO_FORM,
+    RUN,
+    Row,
+    nominal_radius_is_off,
+    of_one_size,
+    refuse_another_form,
+    refuse_unusable,
+)
 from tomopose.errors import (
     AmbiguousBallError,
     BallNotFoundError,
     BallTruncatedError,
     DetectionError,
     InputError,
-    ShapeError,
     TomoposeError,
 )
 from tomopose.geometry.scanner import Scanner
 from tomopose.observations import BallObservations
 from tomopose.units import Array
-
-RUN = 5
-"""From this many images on, blur is compared with the run's median: a spot that is not round is no motion."""
-
-OTHER_SIZE = 1.5
-"""Ratio to the run's median radius from which a shape is not the ball: magnification does not vary that much."""
-
-Row = dict[str, Any]
 
 
 class _Lazy:
@@ -93,7 +94,9 @@ def detect(
 
     Raises
     ------
-    InputError  where the counts disagree, or every image is refused for one and the same fault of input (wrong size).
+    InputError  where the counts disagree; where an image has another shape or type than the first; where more than one
+                image and more than 5 % of them, or all, are unusable (unreadable, of the wrong size, bytes or pitches
+                exchanged); where the ball has 20 % more or less than its nominal size in every image.
     """
     lazy = hasattr(images, "region") and hasattr(images, "__len__")
     total = len(images) if hasattr(images, "__len__") else 0  # type: ignore[arg-type]
@@ -121,11 +124,15 @@ def detect(
     for task, row in ordered_map(work, tasks(), workers=workers, executor=executor):
         if path is not None and row is not done.get(row["name"]) and row != done.get(row["name"]):
             append(path, row)
+        if rows and np.ndim(origin) == 1:
+            refuse_another_form(rows[0], row)
         rows.append({**row, "lag": _lag(task[0], task[3], scanner, row, rows[-1] if rows else None)})
         if progress is not None:
             progress(len(rows), total)
-    _refuse_common_fault(rows)
-    return _observations(rows, ids, names)
+    refuse_unusable(rows)
+    rows = of_one_size(rows)
+    off = nominal_radius_is_off(rows, expected_radius(scanner, ball_diameter), ball_diameter)
+    return _observations(rows, ids, names, off)
 
 
 def _origin_of(origin: Any, index: int) -> tuple[int, int]:
@@ -138,18 +145,20 @@ def _row(
     scanner: Scanner, ball_diameter: float, mask: Any, settings: str, keyed: bool,
 ) -> Row:  # fmt: skip
     """One image's row as plain numbers, for journal and process borders."""
-    row: Row = {"name": name, "key": ""}
+    row: Row = {"name": name, "key": "", "form": list(NO_FORM)}
+    options = {"ball_diameter": ball_diameter, "predicted": predicted, "origin": origin, "mask": mask}
     try:
         if not isinstance(image, _Lazy):
             image = np.asarray(image)
+        row["form"] = [list(image.shape), getattr(getattr(image, "dtype", None), "name", "")]
         if keyed:
             row["key"] = fingerprint(image, f"{settings} {predicted} {origin}") if len(image.shape) == 2 else ""
             if done is not None and row["key"] and done.get("key") == row["key"]:
                 return done
-        ball = detect_image(
-            image, scanner, ball_diameter=ball_diameter, predicted=predicted, origin=origin, mask=mask
-        )
-        return row | _numbers(ball)
+        try:
+            return row | _numbers(detect_image(image, scanner, **options))
+        except DetectionError as error:
+            raise fault_of_input(image, scanner, **options) or error from error
     except (TomoposeError, OSError, ValueError, EOFError) as error:
         return row | {"reason": _reason(error), "fault": type(error).__name__}
 
@@ -205,14 +214,9 @@ def _lag(image: Any, origin: tuple[int, int], scanner: Scanner, row: Row, previo
     )  # fmt: skip
 
 
-def _refuse_common_fault(rows: list[Row]) -> None:
-    """Raises where no image could even be looked at: that is the caller's input, not one bad image."""
-    if rows and all(row.get("fault") in ("InputError", "ShapeError") for row in rows):
-        error = ShapeError if rows[0]["fault"] == "ShapeError" else InputError
-        raise error(f"all {len(rows)} images are refused; the first: {rows[0]['reason'].removeprefix('bad image: ')}")
-
-
-def _observations(rows: list[Row], ids: tuple[str, ...] | None, names: tuple[str, ...] | None) -> BallObservations:
+def _observations(
+    rows: list[Row], ids: tuple[str, ...] | None, names: tuple[str, ...] | None, off: bool
+) -> BallObservations:
     n = len(rows)
     if ids is not None and len(ids) != n:
         raise InputError(f"{n} images but {len(ids)} pose ids; one for each image is needed")
@@ -220,9 +224,6 @@ def _observations(rows: list[Row], ids: tuple[str, ...] | None, names: tuple[str
     usual = np.zeros(2)
     if seen.sum() >= RUN:
         usual = np.median([row["anisotropy"] for row in rows if "x_D" in row], axis=0)
-        radius = float(np.median([row["radius"] for row in rows if "x_D" in row]))
-        rows = [_of_the_run(row, radius) for row in rows]
-        seen = np.array(["x_D" in row for row in rows], dtype=bool)
 
     def column(name: str, *shape: int) -> Array:
         missing = np.full(shape, np.nan)
@@ -233,7 +234,7 @@ def _observations(rows: list[Row], ids: tuple[str, ...] | None, names: tuple[str
         covariance=column("covariance", 2, 2),
         pose_id=ids if ids is not None else tuple(str(i) for i in range(n)),
         seen=seen,
-        status=tuple(_status(row, usual) for row in rows),
+        status=tuple(_status(row, usual, off) for row in rows),
         image=names,
         snr=column("snr"),
         semi_major=column("semi_major"),
@@ -243,22 +244,12 @@ def _observations(rows: list[Row], ids: tuple[str, ...] | None, names: tuple[str
     )
 
 
-def _of_the_run(row: Row, radius: float) -> Row:
-    """The row, or a refusal where it shows something of quite another size than the other images."""
-    if "x_D" not in row or abs(math.log(row["radius"] / radius)) < math.log(OTHER_SIZE):
-        return row
-    u, v = row["x_D"]
-    return {
-        "name": row["name"],
-        "reason": f"not found: the shape at ({u:.0f}, {v:.0f}) has a radius of {row['radius']:.1f} px, the ball in the "
-        f"other images {radius:.1f} px",
-    }
-
-
-def _status(row: Row, usual: Array) -> str:
+def _status(row: Row, usual: Array, off: bool) -> str:
     if "x_D" not in row:
         return str(row["reason"])
     flags = [f for f in row["flags"] if f != "moved"]
+    if off and "radius off nominal" not in flags:
+        flags.append("radius off nominal")
     if motion_length(np.asarray(row["anisotropy"]) - usual, np.asarray(row["anisotropy_covariance"])) > MOTION:
         flags.append("moved")
     if row["lag"] > 0:

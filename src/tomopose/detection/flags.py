@@ -17,7 +17,9 @@ FLAGS = {
     "bad pixels on the rim": "dead, hot or masked pixels on the rim were left out",
     "saturated": "part of the background along the rim is clipped at the detector's ceiling",
     "few photons": "contrast below 15 standard deviations of a pixel's noise",
-    "radius off nominal": "silhouette more than 20 % off what ball_diameter gives at the rotation axis",
+    "edge at the rim": "a holder's edge or glue at the rim makes the centre uncertain; the larger sigma says so",
+    "radius off nominal": "silhouette more than 20 % off what ball_diameter gives at the rotation axis, or more than "
+    "2 % in every image of a run",
     "moved": "the blur depends on direction, as when the ball moves during the exposure",
     "bright ball": "the ball is brighter than its surroundings: is the image inverted or a logarithm?",
     "8-bit": "the image has 256 levels at most",
@@ -30,6 +32,8 @@ SATURATED, MOSTLY_SATURATED = 0.02, 0.3
 NOISE_FREE = 1e-4
 """Noise, in contrasts, below which an image counts as computed without noise."""
 FEW = 15.0
+DOUBTED = 0.4
+"""Share of the centre's variance from which edges at the rim are worth a word."""
 OFF_NOMINAL = 0.2
 MOTION = 0.5
 """Shortest motion that is called so, px: a uniform motion by L adds L^2 / 12 to the blur's variance along it."""
@@ -75,13 +79,15 @@ def flags_of(
         )
     if fit.lost > 0.5:
         raise DetectionError(f"bad pixels on the rim: {100 * fit.lost:.0f} % of its pixels cannot be used")
+    moved = motion_length(fit.anisotropy, fit.anisotropy_covariance) > MOTION
     present = {
         "truncated": fit.visible < WHOLE_RIM,
         "bad pixels on the rim": fit.lost > LOST,
         "saturated": saturated > SATURATED,
         "few photons": fit.snr < FEW,
+        "edge at the rim": fit.doubt > DOUBTED and not moved,
         "radius off nominal": abs(fit.shape[2] / expected - 1.0) > OFF_NOMINAL,
-        "moved": motion_length(fit.anisotropy, fit.anisotropy_covariance) > MOTION,
+        "moved": moved,
         "bright ball": bright,
         "8-bit": eight_bit,
     }
