@@ -31,6 +31,9 @@ CONVINCING = 0.6
 """Merit from which a candidate ends the search."""
 SIZES = 1.6
 """Ratio to the expected radius, either way, of a ball that is looked for first."""
+BLUNT = 1.15
+"""Ratio beyond a level's radii of circles that are still seen on it; with it one level holds all between
+expected_radius / SIZES and expected_radius SIZES, for levels follow by 2 and LARGEST / SMALLEST BLUNT^2 > 2 SIZES^2."""
 PRIOR = 0.25
 """Width of the preference for the nominal radius, in log radius: loose, for magnification varies with the pose."""
 
@@ -134,10 +137,9 @@ def _candidates(image: Array, expected_radius: float, aspect: float, smallest: f
 
 
 def _groups(levels: list[int], expected_radius: float) -> tuple[list[int], ...]:
-    """The levels in the order of search: few that hold the expected radius, finer ones that show it too, all others."""
+    """The levels in the order of search: the one for the expected radius, others that show it too, all others."""
     low, high = expected_radius / SIZES, expected_radius * SIZES
-    start = max((f for f in levels if SMALLEST * f <= low), default=levels[0])
-    central = [f for f in levels if f == start or (f > start and LARGEST * f / 2 < high)]
+    central = [min((f for f in levels if BLUNT * LARGEST * f >= high), default=levels[-1])]
     near = [f for f in levels if SMALLEST * f < high and LARGEST * f > low and f not in central]
     return central, near, [f for f in levels if f not in central and f not in near]
 

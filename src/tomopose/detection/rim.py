@@ -74,15 +74,16 @@ class Rim:
         """Takes the pixels of the ring about the current silhouette, one in `every`, and places the angular nodes."""
         many = MANY if self.every == 1 else math.inf
         u, v, value, thinned, rim = self.ring(self.good, -self.inside, self.outside, self.every, many)
-        self.u, self.v, self.value, self.rim, self.left, self.share, self.bounds = by_sector(
-            u, v, value, rim, -self.inside, self.outside, NEAR if thinned else self.outside, self.n_nodes, EDGES
+        self.u, self.v, self.value, rows, self.left, self.share, self.bounds = by_sector(
+            u, v, value, rim, -self.inside, self.outside, NEAR if thinned else self.outside, self.n_nodes, EDGES, 14
         )
+        self.rim, self.jacobian = rows[:6], rows[6:]
         self.first = self.bounds[::SHELLS]
         n = self.u.size
         if n < 4 * self.n_nodes:
             at = f"({self.shape[0]:.1f}, {self.shape[1]:.1f})"
             raise BallNotFoundError(f"only {n} usable pixels round the rim at {at}")
-        self.model, self.jacobian, self.weight = np.empty(n), np.empty((14, n)), np.ones(n)
+        self.model, self.weight = np.empty(n), np.ones(n)
         self._sums = None
 
     def ring(
