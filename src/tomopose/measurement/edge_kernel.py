@@ -21,11 +21,15 @@ GAUSS_NEWTON = 12
 RECENTRINGS = 3
 AGAIN = 0.3
 """Share of the contrast by which grey must come back for a second edge."""
-S, A, B, RMS, S_VARIANCE, INNER_SLOPE, OUTER_SLOPE, D_SIGMA, D_SIGMA_2, S_BY_A, S_BY_B, S_VARIANCE_HELD = range(12)
+COARSE = 0.5
+"""Distance of samples beyond the window, voxels."""
+(S, A, B, RMS, S_VARIANCE, INNER_SLOPE, OUTER_SLOPE, D_SIGMA, D_SIGMA_2, S_BY_A, S_BY_B, S_VARIANCE_HELD,
+ AA, AB, BB, INSIDE, OUTSIDE) = range(17)
 """Columns of a result: s_0, a, b, rms of the fit, variance of s_0 for unit noise, differences of the two halves of
 each plateau, the sums that a common step in sigma is made of, by how much s_0 moves with a and b held elsewhere, and
-its variance then (only where a step was fitted)."""
-N_COLUMNS = 12
+its variance then, the normal equations of a and b with s_0 eliminated, the mean grey levels beyond the window on both
+sides (from the variance on only where a step was fitted; the last two only where nothing else is near)."""
+N_COLUMNS = 17
 BORDER, NO_EDGE, THIN, NOT_CONVERGED = 1, 2, 4, 8
 
 
@@ -152,6 +156,7 @@ def _fit_edge(g: Any, sigma: Any, window: Any, start: Any, a: Any, b: Any, out: 
     det = h11 * (h22 * h33 - h23 * h23) - h12 * (h12 * h33 - h13 * h23) + h13 * (h12 * h23 - h13 * h22)
     out[S_VARIANCE] = (h22 * h33 - h23 * h23) / det
     out[S_BY_A], out[S_BY_B], out[S_VARIANCE_HELD] = -h12 / h11, -h13 / h11, 1.0 / h11
+    out[AA], out[AB], out[BB] = h22 - h12 * h12 / h11, h23 - h12 * h13 / h11, h33 - h13 * h13 / h11
     _judge(g, sigma, window, s_0, a, b, out)
     # What of a step in sigma the edge's own three parameters would take up.
     q1 = q2 = q3 = 0.0
@@ -202,12 +207,43 @@ def _judge(g: Any, sigma: Any, window: Any, s_0: Any, a: Any, b: Any, out: Any) 
     out[OUTER_SLOPE] = far_out / n_far_out - near_out / n_near_out if n_far_out > 0 and n_near_out > 0 else np.nan
 
 
+@njit(cache=True)
+def _beyond(c: Any, p: Any, n: Any, middle: Any, sigma: Any, window: Any, longer: Any, out: Any) -> Any:
+    """Mean grey from the window's ends to `longer` beyond them, into a row of results; nan for both where the line
+    leaves the array, or where another edge is so near that its blur reaches there."""
+    steps = round(longer / COARSE)
+    guard = math.ceil(2.5 * sigma / COARSE)
+    limit = AGAIN * (out[A] - out[B])
+    inside = outside = 0.0
+    for side in (-1.0, 1.0):
+        level = out[A] if side < 0 else out[B]
+        total = before = last = 0.0
+        for k in range(1, steps + guard + 1):
+            s = middle + side * (window + k * COARSE)
+            z, y, x = p[0] + s * n[0], p[1] + s * n[1], p[2] + s * n[2]
+            if (min(z, y, x) < 1.0 or z > c.shape[0] - 2.000001 or y > c.shape[1] - 2.000001
+                    or x > c.shape[2] - 2.000001):
+                return
+            g = spline_value(c, z, y, x)
+            if k > 2 and abs((g + last + before) / 3.0 - level) > limit:
+                return
+            before, last = last, g
+            if k <= steps:
+                total += g
+        if side < 0:
+            inside = total / steps
+        else:
+            outside = total / steps
+    out[INSIDE], out[OUTSIDE] = inside, outside
+
+
 @njit(cache=True, parallel=True)
-def search_lines(c: Any, index: Any, step: Any, sigma: Any, window: Any, search: Any, fit: Any) -> Any:
+def search_lines(c: Any, index: Any, step: Any, sigma: Any, window: Any, search: Any, fit: Any, longer: Any) -> Any:
     """Edges along n lines.
 
     c: spline coefficients [z, y, x]; index (n, 3): start points as (iz, iy, ix); step (n, 3): the normal's unit length
-    in the same units; sigma, window, search: in lengths of that unit; fit: False stops at the local 50 %.
+    in the same units; sigma, window, search: in lengths of that unit; fit: False stops at the local 50 %; longer: how
+    far beyond the window grey levels are looked at, 0 for not at all.
     Returns results (n, N_COLUMNS) and flags (n,) uint8; where a flag is set s_0 is nan or doubtful.
     """
     n = index.shape[0]
@@ -251,4 +287,6 @@ def search_lines(c: Any, index: Any, step: Any, sigma: Any, window: Any, search:
             middle += shift
         if not abs(result[i, S]) <= search and flags[i] == 0:
             flags[i] = NO_EDGE
+        if fit and longer > 0 and flags[i] == 0:
+            _beyond(c, index[i], step[i], middle, sigma, window, longer, result[i])
     return result, flags

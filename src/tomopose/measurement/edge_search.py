@@ -42,6 +42,9 @@ LAYERS = 128
 SIGMA_SAMPLE, SIGMA_ROUNDS, SIGMA_TOLERANCE = 3000, 40, 2e-5
 SIGMA_RANGE = (0.3, 4.0)
 START_SIGMA = 1.0
+LONGER, LEVEL, LEAST_LONGER = 4.0, 3e-3, 100
+"""By how many voxels plateaus may be longer, the share of the contrast by which that may change the levels of the whole
+surface, and the number of edges from which that can be told."""
 FLAT_SHARE, FLAT_NOISE = 0.1, 3.0
 """A plateau counts as missing where its halves differ by more than this share of the contrast plus so many rms."""
 
@@ -51,7 +54,8 @@ class EdgeSettings:
     """How edges are searched for.
 
     search_distance:    how far from its start an edge may lie, in voxels.
-    window:             half length of the profile that is fitted, in voxels; from sigma where None: 2.5 sigma + 1.5.
+    window:             half length of the profile that is fitted, in voxels; from sigma where None: 2.5 sigma + 1.5,
+                        with plateaus LONGER by 4 where they are shared, level so far, and no other edge is near.
     contrast_threshold: share of the global contrast below which an edge is not believed.
     method:             esf: fit of a blurred step; local-50: 50 % between the plateaus.
     sigma:              standard deviation of the blur, mm; estimated from the edges where None.
@@ -89,6 +93,7 @@ class Edges:
     u:       (n,) mm, standard uncertainty of the offset from the profile's own residuals, as if the noise of voxels
              were independent.
     flags:   (n,) EdgeFlag values, uint8;  sigma: blur, mm;  window: half length of the profiles, mm.
+    longer:  number of edges whose plateaus reach LONGER voxels beyond it.
     """
 
     offset: Array
@@ -99,6 +104,7 @@ class Edges:
     flags: np.ndarray
     sigma: float
     window: float
+    longer: int = 0
 
     def __post_init__(self) -> None:
         for name in ("offset", "inside", "outside", "residual", "u"):
@@ -155,7 +161,8 @@ def search_edges(
             result[rows], flags[rows] = _piece(volume, index[rows], step[rows], sigma, window, settings)
         if progress is not None:
             progress(done + 1, len(starts))
-    edges = _judged(result, flags, sigma, window, unit, settings, contrast)
+    longer = _lengthen(result, flags)
+    edges = replace(_judged(result, flags, sigma, window, unit, settings, contrast), longer=longer)
     return edges if settings.plateau_radius == 0 else _shared(edges, result, x, n, unit, settings.plateau_radius)
 
 
@@ -180,7 +187,9 @@ def _piece(
     volume: Volume, index: Array, step: Array, sigma: float, window: float, settings: EdgeSettings
 ) -> tuple[Array, np.ndarray]:
     """Edges of lines that lie close together: the part of the volume about them is read and filtered."""
-    reach = (settings.search_distance + 2 * window + 2) * np.abs(step).max(axis=0)
+    longer = LONGER if settings.window is None and settings.plateau_radius > 0 else 0.0
+    reach = settings.search_distance + 2 + window + max(window, longer + 2.5 * sigma + 1)
+    reach = reach * np.abs(step).max(axis=0)
     low = np.maximum(np.floor(index.min(axis=0) - reach).astype(int) - REACH, 0)
     high = np.minimum(np.ceil(index.max(axis=0) + reach).astype(int) + REACH + 1, volume.grid.shape)
     if (high - low < 4).any():
@@ -188,7 +197,7 @@ def _piece(
     part = volume.values[low[0]: high[0], low[1]: high[1], low[2]: high[2]]
     coefficients = spline_coefficients(part)
     return kernel.search_lines(
-        coefficients, index - low, step, sigma, window, settings.search_distance, settings.method == "esf"
+        coefficients, index - low, step, sigma, window, settings.search_distance, settings.method == "esf", longer
     )
 
 
@@ -208,7 +217,8 @@ def _estimated_sigma(volume: Volume, index: Array, step: Array, settings: EdgeSe
     sigma = START_SIGMA
     for _ in range(SIGMA_ROUNDS):
         result, flags = kernel.search_lines(
-            coefficients, index[rows] - low, step[rows], sigma, _window(settings, sigma), settings.search_distance, True
+            coefficients, index[rows] - low, step[rows], sigma, _window(settings, sigma), settings.search_distance,
+            True, 0.0,
         )
         good = flags == 0
         if not good.any():
@@ -224,6 +234,37 @@ def _estimated_sigma(volume: Volume, index: Array, step: Array, settings: EdgeSe
         if abs(change) < SIGMA_TOLERANCE:
             break
     return sigma
+
+
+def _lengthen(result: Array, flags: np.ndarray) -> int:
+    """Longer plateaus, which tell grey levels better, where nothing speaks against them: into the rows of results.
+
+    The levels beyond the window join the least squares of each fit that has them.  None do where that would change
+    levels over the whole surface (cupping): the median change, and twice what it is uncertain by, must stay below LEVEL
+    of the contrast.  Returns how many did.
+    """
+    rows = np.flatnonzero((flags == 0) & np.isfinite(result[:, kernel.INSIDE]))
+    if len(rows) < LEAST_LONGER:
+        return 0
+    n = LONGER / kernel.STEP
+    found = result[rows]
+    aa, ab, bb = found[:, kernel.AA] + n, found[:, kernel.AB], found[:, kernel.BB] + n
+    det = aa * bb - ab**2
+    more = n * (found[:, [kernel.INSIDE, kernel.OUTSIDE]] - found[:, [kernel.A, kernel.B]])
+    change = np.column_stack([bb * more[:, 0] - ab * more[:, 1], aa * more[:, 1] - ab * more[:, 0]]) / det[:, None]
+    median = np.median(change, axis=0)
+    spread = 1.4826 * np.median(np.abs(change - median), axis=0)
+    # Neighbours share voxels: every fourth counts.
+    certain = np.abs(median) + 2 * 1.2533 * spread / np.sqrt(len(rows) / 4)
+    if (certain > LEVEL * np.median(found[:, kernel.A] - found[:, kernel.B])).any():
+        return 0
+    by_a, by_b = found[:, kernel.S_BY_A], found[:, kernel.S_BY_B]
+    result[rows, kernel.A] += change[:, 0]
+    result[rows, kernel.B] += change[:, 1]
+    result[rows, kernel.S] += by_a * change[:, 0] + by_b * change[:, 1]
+    result[rows, kernel.S_VARIANCE] = (found[:, kernel.S_VARIANCE_HELD]
+                                       + (by_a**2 * bb - 2 * by_a * by_b * ab + by_b**2 * aa) / det)
+    return len(rows)
 
 
 def _judged(

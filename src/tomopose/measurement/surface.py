@@ -166,7 +166,8 @@ def _moved(
 
 def _in_words(found: Edges) -> str:
     counts = counts_in_words(found.flags)
-    return f"{int(found.good.sum())} of {len(found.flags)} edges measured" + (f"; {counts}" if counts else "")
+    longer = f"; {found.longer} with longer plateaus" if found.longer else ""
+    return f"{int(found.good.sum())} of {len(found.flags)} edges measured{longer}" + (f"; {counts}" if counts else "")
 
 
 def _by_slab(volume: Volume, points: Array, reach: int, layers: int, function: Callable[..., Array]) -> Array:
