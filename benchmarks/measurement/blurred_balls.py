@@ -122,9 +122,8 @@ def main():
     if args.time:
         time_large(args.time, 1)
         return
-    window = 2.5 * SIGMA + 1.5 if args.window is None else args.window
-    print(f"bound of a centre, CNR 20: {bound(args.radius):.5f} with known levels, {bound(args.radius, window):.5f} "
-          f"with levels from the {window:g} voxels on both sides")
+    print(f"bound of a centre, CNR 20: {bound(args.radius):.5f} with known levels, with levels from the 8 or 4 voxels "
+          f"on both sides {bound(args.radius, 8.0):.5f}, {bound(args.radius, 4.0):.5f}")
     print("voxels: centre rms (3-D), radius bias, radius sd, residual rms, full range, D95, 25 patches")
     table = {}
     for seed in range(1, args.seeds + 1):
