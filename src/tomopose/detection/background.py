@@ -39,7 +39,8 @@ def whole_ring(rim: Rim, spread: float) -> None:
     rim.gather()
     rim.linear = True
     _robust_background(rim, spread)
-    rim.linear, rim._sums = False, None
+    rim.linear = False
+    rim.forget()
 
 
 def _robust_background(rim: Rim, spread: float) -> None:

@@ -30,16 +30,14 @@ def nearer(rim: Rim, active: npt.NDArray[np.intp], *, careful: bool, noise: floa
     sizes = [n for n in range(1, SHELLS + 1) if n == 1 or rim.outside > SHELL_EDGES[n - 2]]
     if len(sizes) == 1:
         return np.zeros((2, 2))
-    N, g = rim.shell_sums(0, 1)
+    blocks = rim.blocks(0, 1)
     steps, covariances = [], []
     unit = np.eye(active.size, 3)
     for n in sizes:
         if n > 1:
-            N_more, g_more = rim.shell_sums(n - 1, n)
-            N, g = N + N_more, g + g_more
-        part, right = rim.with_priors(N, g, active)
-        unit[:, 2] = right
-        X = solve(part, unit)
+            blocks = blocks + rim.blocks(n - 1, n)
+        N, unit[:, 2] = rim.with_priors(*rim.sum_of(blocks), active)
+        X = solve(N, unit)
         steps.append(X[:2, 2])
         covariances.append((X[:2, :2] + X[:2, :2].T) / 2)
     chosen = len(sizes) - 1
@@ -50,7 +48,7 @@ def nearer(rim: Rim, active: npt.NDArray[np.intp], *, careful: bool, noise: floa
             break
         chosen -= 1
     if chosen == len(sizes) - 1:
-        rim.keep(N, g)
+        rim.keep(blocks)
         return np.zeros((2, 2))
     rim.use_shells(sizes[chosen])
     rim.polish(active, careful=careful)

@@ -1,4 +1,7 @@
-"""Normal equations of the fit, sector by sector: N = J' W J and g = J' W (image - model)."""
+"""Normal equations of the fit: N = J' W J and g = J' W (image - model), sums over sectors of small blocks.
+
+A sector's pixels see the shape, w and the two nodes at its sides: 14 parameters, whatever the number of nodes.
+"""
 
 from __future__ import annotations
 
@@ -9,47 +12,62 @@ from numba import njit
 
 from tomopose.detection.edges import FIRST_NODE, KAPPA, SHELLS, WHITE
 
+LOCAL = FIRST_NODE + 6
+"""Parameters of a sector, in the order of the Jacobian's rows."""
+
 
 @njit(cache=True, fastmath=True)
-def normal_equations(image, value, jacobian, first, weight, columns, low, high):  # type: ignore[no-untyped-def]
-    """(N, g): weighted normal matrix (8 + 3k, 8 + 3k) and right side J' W (image - value) of the shells low to high.
+def sector_blocks(image, value, jacobian, first, weight, columns, low, high):  # type: ignore[no-untyped-def]
+    """(k, LOCAL + 1, LOCAL): each sector's part of N, lower triangle, and in the last row of g; shells low to high.
 
     first: (k SHELLS + 1,) of by_sector.  columns: rows of the Jacobian that count (the others are left 0).  Within a
     sector every entry is one sum along the pixels, which runs in registers.
     """
     k = (first.shape[0] - 1) // SHELLS
-    size = FIRST_NODE + 3 * k
-    N = np.zeros((size, size))
-    g = np.zeros(size)
+    out = np.zeros((k, LOCAL + 1, LOCAL))
     longest = 0
     for node in range(k):
         longest = max(longest, first[node * SHELLS + high] - first[node * SHELLS + low])
     row = np.empty(longest)
     for node in range(k):
-        start = first[node * SHELLS + low]
-        n = first[node * SHELLS + high] - start
-        if n == 0:
-            continue
-        w, y, y_model = weight[start : start + n], image[start : start + n], value[start : start + n]
+        start, stop = first[node * SHELLS + low], first[node * SHELLS + high]
+        n = stop - start
+        w, y, y_model = weight[start:stop], image[start:stop], value[start:stop]
         for i_p in range(columns.shape[0]):
             p = columns[i_p]
-            at_p = _place(p, node, k)
-            a = jacobian[p, start : start + n]
+            a = jacobian[p, start:stop]
             total = 0.0
             for i in range(n):
                 row[i] = a[i] * w[i]
                 total += row[i] * (y[i] - y_model[i])
-            g[at_p] += total
+            out[node, LOCAL, p] = total
             for i_q in range(i_p + 1):
                 q = columns[i_q]
-                at_q = _place(q, node, k)
-                b = jacobian[q, start : start + n]
+                b = jacobian[q, start:stop]
                 total = 0.0
                 for i in range(n):
                     total += row[i] * b[i]
-                N[at_p, at_q] += total
-                if i_p != i_q:
-                    N[at_q, at_p] += total
+                out[node, p, q] = total
+    return out
+
+
+@njit(cache=True)
+def assembled(blocks, share):  # type: ignore[no-untyped-def]
+    """(N (8 + 3k, 8 + 3k), g): the sum of the sectors' blocks, each times its `share` (k,)."""
+    k = blocks.shape[0]
+    size = FIRST_NODE + 3 * k
+    N, g = np.zeros((size, size)), np.zeros(size)
+    place = np.empty(LOCAL, np.int64)
+    for node in range(k):
+        for p in range(LOCAL):
+            place[p] = _place(p, node, k)
+        for p in range(LOCAL):
+            g[place[p]] += share[node] * blocks[node, LOCAL, p]
+            for q in range(p + 1):
+                x = share[node] * blocks[node, p, q]
+                N[place[p], place[q]] += x
+                if p != q:
+                    N[place[q], place[p]] += x
     return N, g
 
 

@@ -18,7 +18,7 @@ from tomopose.detection.cone import (
     thinned_ring,
 )
 from tomopose.detection.edges import FIRST_NODE, KAPPA, N_SHAPE, SHAPE, SHELL_EDGES, SHELLS, WHITE, model_rows
-from tomopose.detection.normal import gradient, normal_equations, with_priors
+from tomopose.detection.normal import assembled, gradient, sector_blocks, with_priors
 from tomopose.detection.profile import edge_profile
 from tomopose.errors import BallNotFoundError
 from tomopose.geometry.scanner import Scanner
@@ -61,6 +61,7 @@ class Rim:
         self.shells, self.turned, self.linear = SHELLS, False, False
         self.margin = 1.6 + cone_eccentricity(scanner, self.shape[:2], radius * self.gamma_px)
         self._sums: tuple[Array, Array, Array] | None = None
+        self._blocks: tuple[Array, Array] | None = None
         self.begin()
 
     def begin(self) -> None:
@@ -84,7 +85,7 @@ class Rim:
             at = f"({self.shape[0]:.1f}, {self.shape[1]:.1f})"
             raise BallNotFoundError(f"only {n} usable pixels round the rim at {at}")
         self.model, self.weight = np.empty(n), np.ones(n)
-        self._sums = None
+        self.forget()
 
     def ring(
         self, good: Array, low: float, high: float, every: int, many: float = math.inf
@@ -134,7 +135,7 @@ class Rim:
             self.rim, self.share, self.bounds, near_shells, self.nodes, self.white, profile, self._opaque(), first,
             step, s[3], self.gamma_px, self.box_u, self.box_v, s[5], s[6], self.model, self.jacobian,
         )  # fmt: skip
-        self._sums = None
+        self.forget()
 
     def _opaque(self) -> bool:
         return math.isinf(self.shape[KAPPA])
@@ -156,36 +157,44 @@ class Rim:
         """Rows of the Jacobian that count in a shell: far from the rim an edge's width and height do not."""
         return _columns(self._opaque(), self.turned, self.linear, shell > 0 and self._ends_near())
 
-    def shell_sums(self, low: int, high: int, weight: Array | None = None) -> tuple[Array, Array]:
-        """Normal matrix and right side of all parameters, without priors, of the shells from low to before high."""
-        N, g = normal_equations(
-            self.value, self.model, self.jacobian, self.bounds, self.weight if weight is None else weight,
-            self.columns(low), low, high,
-        )  # fmt: skip
-        return N, g
+    def blocks(self, low: int, high: int) -> Array:
+        """Each sector's part of the normal equations, without priors, of the shells from low to before high."""
+        return np.asarray(sector_blocks(
+            self.value, self.model, self.jacobian, self.bounds, self.weight, self.columns(low), low, high
+        ))  # fmt: skip
 
-    def sums_with(self, weight: Array) -> tuple[Array, Array]:
-        """Normal matrix and right side without priors, of pixels with these weights."""
-        N, g = self.shell_sums(0, 1, weight)
-        if self.shells > 1 and self.bounds[-1] > 0:
-            N_far, g_far = self.shell_sums(1, self.shells, weight)
-            N, g = N + N_far, g + g_far
-        return N, g
+    def all_blocks(self) -> Array:
+        """blocks of all shells that have weight; kept until model or weights change."""
+        if self._blocks is None or self._blocks[0] is not self.weight:
+            near = self.blocks(0, 1)
+            far = self.shells > 1 and self.bounds[-1] > 0
+            self.keep(near + self.blocks(1, self.shells) if far else near)
+        assert self._blocks is not None
+        return self._blocks[1]
+
+    def keep(self, blocks: Array) -> None:
+        """Takes these for the blocks at the present model and weights."""
+        self._blocks, self._sums = (self.weight, blocks), None
 
     def sums(self) -> tuple[Array, Array]:
-        """sums_with the rim's own weights; kept until the model or the weights change."""
+        """Normal matrix and right side of all parameters, without priors; kept like the blocks."""
         if self._sums is None or self._sums[0] is not self.weight:
-            self.keep(*self.sums_with(self.weight))
-        assert self._sums is not None
+            self._sums = (self.weight, *self.sum_of(self.all_blocks()))
         return self._sums[1], self._sums[2]
 
-    def keep(self, N: Array, g: Array) -> None:
-        """Takes these for the sums at the present model and weights."""
-        self._sums = (self.weight, N, g)
+    def sum_of(self, blocks: Array, share: Array | None = None) -> tuple[Array, Array]:
+        """Normal matrix and right side of the sectors' blocks, each times its share."""
+        N, g = assembled(blocks, np.ones(self.n_nodes) if share is None else share)
+        return N, g
+
+    def forget(self) -> None:
+        """Drops what was kept, after a change of the model or of what counts in it."""
+        self._blocks = self._sums = None
 
     def turn(self) -> None:
         """Lets the blur depend on direction from here on."""
-        self.turned, self._sums = True, None
+        self.turned = True
+        self.forget()
 
     def normal(self, active: npt.NDArray[np.intp]) -> tuple[Array, Array]:
         """Normal matrix and right side of the active parameters, priors included."""
@@ -208,7 +217,7 @@ class Rim:
                 g = gradient(
                     self.value, self.model, self.jacobian, self.bounds, self.weight, self.columns(0), self.shells
                 )
-                self.keep(N, g)
+                self._sums = (self.weight, N, g)
 
     def step(self, active: npt.NDArray[np.intp], *, careful: bool = False) -> float:
         """One Gauss-Newton step, shortened while it makes the fit worse if `careful`.

@@ -52,11 +52,12 @@ def rounder(rim: Rim, active: npt.NDArray[np.intp], *, parameters: float, noise:
     share = kept(residual)
     if share.min() > TRUSTED:
         return np.zeros((2, 2))
+    blocks = rim.all_blocks()
     unit, step = np.eye(active.size, 3), np.zeros(FIRST_NODE + 3 * rim.n_nodes)
     for turn in range(TURNS):
         if turn > 0:
             share = kept(residual - changes(rim.jacobian, rim.left, step, rim.n_nodes))
-        N, unit[:, 2] = rim.with_priors(*rim.sums_with(rim.weight * share[rim.left]), active)
+        N, unit[:, 2] = rim.with_priors(*rim.sum_of(blocks, share), active)
         X = solve(N, unit)
         step[active] = X[:, 2]
     first = solve(rim.normal(active)[0], unit[:, :2])[:2]
