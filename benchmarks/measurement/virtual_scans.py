@@ -11,6 +11,7 @@ states it; several sets of draws, so that the luck of one does not count.  Inter
     fit         of the single scan, from the scatter of its points
     simulation  corrected by the draws of one set: mean over the sets, lowest and highest
     all draws   corrected by the draws of all sets together
+    one another corrected by 5, 10, 20 and 39 scans of other objects in place of draws: the rule alone, for any number
 """
 
 from __future__ import annotations
@@ -121,6 +122,7 @@ def main():
             for name, found in part.results(1000 * k + run).items():
                 rows.setdefault(name, []).append((found, part.truth[name]))
     report(rows, sets)
+    one_another(rows, args.objects)
 
 
 def held(result, truth, simulated=None):
@@ -142,6 +144,26 @@ def report(rows, sets):
               f"{1000 * whole.u_fit:.2f}); held: fit {100 * fit[:, 0].mean():.1f} %, simulation "
               f"{100 * np.mean(each):.1f} % ({100 * np.min(each):.1f} to {100 * np.max(each):.1f}), all draws "
               f"{100 * all_draws[:, 0].mean():.1f} %, U {1000 * all_draws[:, 1].mean():.2f}", flush=True)
+
+
+def one_another(rows, objects, repeats=20):
+    """How often scans of other objects, one each, tell the error of a scan: by the rule of `budget`."""
+    rng = np.random.default_rng(0)
+    for name, found in rows.items():
+        e = np.array([r.value - truth for r, truth in found]).reshape(objects, -1)
+        shares = []
+        for n in (5, 10, 20, objects - 1):
+            kept = []
+            for k, run in np.ndindex(*e.shape):
+                for _ in range(repeats):
+                    others = rng.permutation(np.delete(np.arange(objects), k))[:n]
+                    d = e[others, rng.integers(0, e.shape[1], n)]
+                    drawn = Simulated(mean=float(d.mean()), u=float(d.std(ddof=1)), low=np.nan, high=np.nan, runs=n,
+                                      stable=False, seed=0)
+                    result, truth = found[k * e.shape[1] + run]
+                    kept.append(held(result, truth, drawn)[0])
+            shares.append(f"{100 * np.mean(kept):.1f} % by {n}")
+        print(f"  {name:3s} held by scans of other objects: {', '.join(shares)}", flush=True)
 
 
 if __name__ == "__main__":
