@@ -147,7 +147,7 @@ def fit_cone(
     together = max(float(rho.sum()), 1.0) if apart else 1.0
     rim.turn()
     doubt = nearer(rim, active, careful=kappa_free, noise=together)
-    doubt += rounder(rim, active, parameters=2.5, noise=together)
+    doubt += rounder(rim, active, doubt, parameters=2.5, noise=together)
     anisotropy, anisotropy_covariance = _anisotropy(rim, shape)
     significance = float(anisotropy @ np.linalg.solve(anisotropy_covariance, anisotropy))
     if significance > 30.0 and np.hypot(*anisotropy) > 0.1 * rim.shape[3] ** 2:

@@ -27,19 +27,19 @@ from tomopose.units import Array
 
 CELL, PARTS = 3.0, 3
 """Height of a cell, px from the rim, and cells that share a sector's width of some 9 px."""
-TRUSTED = 0.9
-"""Where every sector keeps this share of its weight, the second fit would be the first."""
+TRUSTED = 0.6
+"""Where every sector keeps this share of its weight, there is no second fit."""
 TURNS = 2
 """A sector that misfits spoils its neighbours: they are judged once more without it."""
 NEGLIGIBLE = 0.02
 """Share of the first covariance, added to V, below which a D D' proves nothing."""
 
 
-def rounder(rim: Rim, active: npt.NDArray[np.intp], *, parameters: float, noise: float) -> Array:
+def rounder(rim: Rim, active: npt.NDArray[np.intp], doubt: Array, *, parameters: float, noise: float) -> Array:
     """Moves the rim's centre to the estimate above; (2, 2) to add to its covariance.
 
-    parameters: linear ones that a sector's pixels determine.  noise: variance of a sum of pixels over that of as many
-    independent ones.
+    doubt: (2, 2), in the first fit's covariance already.  parameters: linear ones that a sector's pixels determine.
+    noise: variance of a sum of pixels over that of as many independent ones.
     """
     residual = rim.residual
 
@@ -61,7 +61,7 @@ def rounder(rim: Rim, active: npt.NDArray[np.intp], *, parameters: float, noise:
         X = solve(N, unit)
         step[active] = X[:, 2]
     first = solve(rim.normal(active)[0], unit[:, :2])[:2]
-    D, V = X[:2, 2], noise * (X[:2, :2] - first)
+    D, V = X[:2, 2], noise * (X[:2, :2] - first) - doubt
     values, axes = np.linalg.eigh((V + V.T) / 2 + NEGLIGIBLE * noise * (first + first.T) / 2)
     V = (axes * np.maximum(values, NEGLIGIBLE * noise * values.max())) @ axes.T
     s = max(float(D @ np.linalg.solve(V, D)) / 2 - 1.0, 0.0)
