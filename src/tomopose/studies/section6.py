@@ -36,7 +36,7 @@ PLAN: Mapping[Scale, Numbers] = {
 }
 """Binning, views and calibration of table 3 at scale "paper"."""
 FINE = 4
-"""Binning up to which a ball of 5 mm is many voxels wide, so that its form shows more than the voxels."""
+"""Binning up to which a ball of 5 mm is many voxels wide, so that the largest error shows more than the voxels."""
 THINGS: tuple[Object, ...] = ("specimen", "standard")
 
 TITLE = "Section 6: dimensional measurements in 3D scans"

@@ -62,9 +62,9 @@ def slices(found: Found) -> Figure:
     )
 
 
-def picture(found: Found, mesh: Mesh, *, third: bool = False) -> Figure:
+def picture(found: Found, mesh: Mesh) -> Figure:
     """Fig. 12: the 3D scan's deviation map by the paper's method and by ours."""
-    names = [CIRCLE] * third + [THEIRS, OURS]
+    names = [THEIRS, OURS]
     maps = {name.replace(", ", "<br>"): deviations(found, panels("specimen")[name]) for name in names}
     return deviation_figure(
         maps, mesh.points, mesh.faces, mesh.normals, range_um=RANGE_UM, title="Fig. 12: deviation map",
@@ -171,7 +171,7 @@ def figures_of(found: Found, mesh: Mesh, numbers: Numbers) -> tuple[Figure, ...]
     standard = compared("standard", runs["standard"])
     orders = [(f"views in {o} order", f"standard-3D-best-run1-{o}", colour)
               for o, colour in (("sequential", ORANGE), ("golden", ACCENT))]
-    return (
+    figures = [
         picture(found, mesh), unrolled(found, mesh), around(found, mesh), slices(found),
         bars(found, compared("specimen", runs["specimen"]), "length_um", lengths, title="Fig. 13: lengths",
              meaning="Errors of L1 to L6 between planes and L7 between calottes.",
@@ -182,9 +182,13 @@ def figures_of(found: Found, mesh: Mesh, numbers: Numbers) -> tuple[Figure, ...]
         bars(found, standard, "form_um", balls, title="Fig. 16: sphericities",
              meaning="Farthest minus nearest point of each ball from its fitted sphere.",
              look_for="Differences between the scans; the common part is the voxels'."),
-        bars(found, orders, "diameter_um", balls, title="Order of the views: diameters",
-             meaning="One iteration of SART from zero, the same images and matrices.",
-             look_for="What the sequence of views alone does."),
-    )
+    ]
+    if all(case in found for _, case, _ in orders):
+        figures.append(bars(
+            found, orders, "diameter_um", balls, title="Order of the views: diameters",
+            meaning="One iteration of SART from zero, the same images and matrices.",
+            look_for="What the sequence of views alone does.",
+        ))
+    return tuple(figures)
 
 
