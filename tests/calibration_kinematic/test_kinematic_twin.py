@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from twin_cases import SCANNER, TwinExperiment, twin_experiment, twin_scan_error
 
-from tomopose import Calibration, projection_matrices
+from tomopose import BallObservations, Calibration, projection_matrices
 from tomopose.calibration.twin_projection import twin_blocks, twin_view_matrices
 from tomopose.calibration.twin_robots import calibrate_twin, twin_matrices, view_geometry
-from tomopose.errors import InputError, ShapeError
+from tomopose.errors import InputError, NotObservableError, ShapeError
 from tomopose.geometry.projection import project, project_ball
 from tomopose.io.calibration_json import read_calibration, write_calibration
 from tomopose.manipulator.inverse import inverse_poses
@@ -112,6 +112,26 @@ def test_perfect_twins_stay_trusted() -> None:
     assert twin_scan_error(cal, e)[0] < 0.03
 
 
+def test_what_views_cannot_tell_of_the_panel_is_refused(twins: TwinExperiment) -> None:
+    """A pitch is found where the views tell it; a prior makes it serve where they do not."""
+    e = twins
+    rough = BallObservations.from_sigma(e.observations.x_D[:20], 5.0, pose_id=e.observations.pose_id[:20])
+    few = replace(e, observations=rough)
+    with pytest.raises(NotObservableError, match="these poses tell p_u only to") as error:
+        calibrated(few, "rigid", free=("p_u",))
+    assert error.value.direction == "p_u"
+    held = calibrated(replace(few, scanner=replace(e.scanner, sigma={"p_u": 1e-4, "d_SD": 0.5})), "rigid")
+    u = {p.name: p.u for p in held.parameters}
+    assert u["p_u"] <= 1e-4
+    assert "d_SD" not in u, "it only names a focal spot"
+
+
+def test_starts_of_the_balls_are_found(twins: TwinExperiment) -> None:
+    e = twins
+    cal = calibrate_twin(e.scanner, e.poses, e.observations, twin=e.twin, mount=e.mount)
+    np.testing.assert_allclose(cal.t, calibrated(e).t, atol=1e-5)
+
+
 def test_wrong_calls_are_refused(twins: TwinExperiment) -> None:
     e = twins
     with pytest.raises(InputError, match="no rotary table"):
@@ -125,7 +145,7 @@ def test_wrong_calls_are_refused(twins: TwinExperiment) -> None:
         calibrate_twin(replace(e.scanner, eta=0.01), e.poses, e.observations, twin=e.twin, mount=e.mount,
                        balls={0: e.ball})
     fewer = replace(e.twin, source_poses=e.twin.source_poses.select(slice(0, 50)))
-    with pytest.raises(InputError, match="not in the pose table"):
+    with pytest.raises(InputError, match="150 of 200 views have no row in the source robot's table"):
         calibrate_twin(e.scanner, e.poses, e.observations, twin=fewer, mount=e.mount, balls={0: e.ball})
     with pytest.raises(ShapeError, match="focus"):
         replace(e.twin, focus=[1.0, 2.0])

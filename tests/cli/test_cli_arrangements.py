@@ -379,7 +379,7 @@ def test_matrices_need_the_tables_of_their_arrangement(twins, capsys):
     (folder / "scan_source.csv").unlink()
     tp.write_poses(folder / "scan_source.csv", short)
     assert matrices(folder, "cal", *source) == 1
-    assert "40 pose ids are not in the pose table" in capsys.readouterr().err
+    assert "40 of 60 views have no row in the source robot's table, the first is '20'" in capsys.readouterr().err
 
 
 def test_a_plain_calibration_takes_no_source_table(files, capsys):

@@ -100,6 +100,7 @@ def calibrate_twin(
     freed = panel_parameters(scanner, free=free, fix=fix, priors=priors)
     turned = inverse_poses(poses)
     data = pair(scanner, turned, observations)
+    _require_both_tables(data.pose_id, twin.source_poses)
     rows = turned.select(data.index)
     T_HT = mount.require(Frame.H, Frame.T)
     if balls is None:
@@ -133,6 +134,16 @@ def calibrate_twin(
     found = calibration_of(None, fits, judged, chosen, model, data.pose_id, ())
     source = twin.source_poses.select(twin.source_poses.index_of(data.pose_id))
     return replace(found, manipulator={**found.manipulator, "source_range": pose_range(source)})
+
+
+def _require_both_tables(pose_id: Sequence[str], source_poses: PoseSequence) -> None:
+    known = set(source_poses.pose_id)
+    missing = [i for i in pose_id if i not in known]
+    if missing:
+        raise InputError(
+            f"{len(missing)} of {len(pose_id)} views have no row in the source robot's table, the first is "
+            f"{missing[0]!r}; that table holds {len(known)} poses, and rows of the two pair by pose_id"
+        )
 
 
 def _require_panel_told(fit: ModelFit) -> None:
@@ -170,6 +181,7 @@ def twin_matrices(
         raise InputError("the arrangement with a standing object has no rotary table; alpha must be 0 in every pose")
     if scanner is not None:
         require_same_scanner(calibration, scanner)
+    _require_both_tables(poses.pose_id, source_poses)
     twin, p = _twin_of(calibration, source_poses)
     turned = inverse_poses(poses)
     own = calibration.scanner
