@@ -15,7 +15,10 @@ RIDGE = 1e-12
 
 
 def solve(N: Array, B: Array) -> Array:
-    """X (n, m) of N X = B, N (n, n) positive definite, B (n, m).  BallNotFoundError where N is not."""
+    """X (n, m) of N X = B, N (n, n) positive definite, of which the upper triangle is read, B (n, m).
+
+    BallNotFoundError where N is not positive definite.
+    """
     good, X = _solve(N, B)
     if not good:
         raise BallNotFoundError("the rim does not determine a ball (singular normal equations)")

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from numba import njit
 from scipy.ndimage import convolve
 
+from tomopose.detection.order import median
 from tomopose.units import Array
 
 REACH = 5
@@ -48,7 +49,7 @@ def evident(square, freedom):  # type: ignore[no-untyped-def]
     return 1.0 + (square - 1.0) / (1.0 + chance)
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
 def weights(s, residual, model, first, sigma, level, white, floor, parameters, outlier):  # type: ignore[no-untyped-def]
     """(weight (n,), variance inside, outside, excess (k,), spread): weights by a variance linear in the level.
 
@@ -64,41 +65,36 @@ def weights(s, residual, model, first, sigma, level, white, floor, parameters, o
     for j in range(k):
         m = 0
         for i in range(first[j], first[j + 1]):
-            if s[i] > 3 * sigma:
-                part[m] = square[i]
-                m += 1
-        limit[j] = np.median(part[:m]) if m > 0 else -1.0
+            part[m] = square[i]
+            m += s[i] > 3 * sigma
+        limit[j] = median(part, m) if m > 0 else -1.0
         largest = max(largest, limit[j])
     for j in range(k):
         limit[j] = outlier**2 * ((limit[j] if limit[j] >= 0.0 else largest) / NORMAL_MEDIAN + floor)
     for i in range(n):
-        if abs(s[i]) <= 3 * sigma:
-            part[n_rim] = square[i]
-            n_rim += 1
-    rim_limit = outlier**2 * np.median(part[:n_rim]) / NORMAL_MEDIAN if n_rim > 0 else 0.0
-    used = np.zeros(n, np.bool_)
+        part[n_rim] = square[i]
+        n_rim += abs(s[i]) <= 3 * sigma
+    rim_limit = outlier**2 * median(part, n_rim) / NORMAL_MEDIAN if n_rim > 0 else 0.0
+    used = np.empty(n)
     mean, level_of, count = np.zeros(k), np.zeros(k), np.zeros(k)
-    n_core, n_inner, core, inner, core_level, inner_level = 0, 0, 0.0, 0.0, 0.0, 0.0
+    n_core, n_inner, core, inner, core_level, inner_level = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(k):
+        on_rim, within = max(limit[j], rim_limit), max(limit[j], outlier**2 * floor)
         for i in range(first[j], first[j + 1]):
-            most = max(limit[j], rim_limit) if abs(s[i]) <= 3 * sigma else limit[j]
-            if s[i] <= -3 * sigma:
-                most = max(most, outlier**2 * floor)
-            if not square[i] < most:
-                continue
-            used[i] = True
-            if s[i] > 3 * sigma:
-                mean[j] += square[i]
-                level_of[j] += model[i]
-                count[j] += 1.0
-            elif s[i] < 0.0:
-                n_inner += 1
-                inner += square[i]
-                inner_level += model[i]
-                if s[i] < -3 * sigma:
-                    n_core += 1
-                    core += square[i]
-                    core_level += model[i]
+            outside, deep = s[i] > 3 * sigma, s[i] < -3 * sigma
+            most = limit[j] if outside else within if deep else on_rim
+            used[i] = 1.0 if square[i] < most else 0.0
+            out = used[i] if outside else 0.0
+            mean[j] += out * square[i]
+            level_of[j] += out * model[i]
+            count[j] += out
+            within_rim, at_core = used[i] if s[i] < 0.0 else 0.0, used[i] if deep else 0.0
+            n_inner += within_rim
+            inner += within_rim * square[i]
+            inner_level += within_rim * model[i]
+            n_core += at_core
+            core += at_core * square[i]
+            core_level += at_core * model[i]
     enough = count > 2 * parameters + 2
     if not np.any(enough):
         return np.zeros(n), np.nan, np.nan, mean, 1.0
@@ -114,14 +110,13 @@ def weights(s, residual, model, first, sigma, level, white, floor, parameters, o
         mean[j] /= min(max((v_in + (usual - v_in) * share[j]) / max(usual, 1e-300), 0.5), 2.0)
     v_out, spread = _quiet(mean[enough], np.median(count[enough]))
     v_out = max(v_out, floor)
-    weight, chi2 = np.zeros(n), np.zeros(k)
+    weight, chi2 = np.empty(n), np.zeros(k)
+    per_level = 1.0 / (level - level_in)
     for j in range(k):
         for i in range(first[j], first[j + 1]):
-            if used[i]:
-                x = min(max((model[i] - level_in) / (level - level_in), 0.0), 1.3)
-                weight[i] = 1.0 / max(v_in + (v_out - v_in) * x, min(v_in, v_out))
-                if s[i] > 3 * sigma:
-                    chi2[j] += square[i] * weight[i]
+            x = min(max((model[i] - level_in) * per_level, 0.0), 1.3)
+            weight[i] = used[i] / max(v_in + (v_out - v_in) * x, min(v_in, v_out))
+            chi2[j] += square[i] * (weight[i] if s[i] > 3 * sigma else 0.0)
         chi2[j] = chi2[j] / max(count[j] - parameters, 1.0) - 1.0 if enough[j] else 0.0
     return weight, v_in, v_out, chi2, spread
 

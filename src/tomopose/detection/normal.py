@@ -53,7 +53,7 @@ def sector_blocks(image, value, jacobian, first, weight, columns, low, high):  #
 
 @njit(cache=True)
 def assembled(blocks, share):  # type: ignore[no-untyped-def]
-    """(N (8 + 3k, 8 + 3k), g): the sum of the sectors' blocks, each times its `share` (k,)."""
+    """(N (8 + 3k, 8 + 3k), upper triangle, g): the sum of the sectors' blocks, each times its `share` (k,)."""
     k = blocks.shape[0]
     size = FIRST_NODE + 3 * k
     N, g = np.zeros((size, size)), np.zeros(size)
@@ -64,10 +64,8 @@ def assembled(blocks, share):  # type: ignore[no-untyped-def]
         for p in range(LOCAL):
             g[place[p]] += share[node] * blocks[node, LOCAL, p]
             for q in range(p + 1):
-                x = share[node] * blocks[node, p, q]
-                N[place[p], place[q]] += x
-                if p != q:
-                    N[place[q], place[p]] += x
+                i, j = min(place[p], place[q]), max(place[p], place[q])
+                N[i, j] += share[node] * blocks[node, p, q]
     return N, g
 
 
@@ -101,7 +99,7 @@ def gradient(image, value, jacobian, first, weight, columns, high):  # type: ign
 
 @njit(cache=True)
 def with_priors(N, g, active, shape, white, nodes, kappa_start, white_prior, node_precision):  # type: ignore[no-untyped-def]
-    """Rows and columns `active` of N and g, priors added.
+    """Rows and columns `active` of N (upper triangle) and g, priors added.
 
     kappa_start: mean and standard deviation of kappa's prior.  white_prior: mean and precision of w's.  node_precision:
     (3k,) of a, about the mean level, and of b and c, about 0.
@@ -119,10 +117,11 @@ def with_priors(N, g, active, shape, white, nodes, kappa_start, white_prior, nod
             precision[i] = node_precision[3 * j + c]
             pull[i] = precision[i] * ((level if c == 0 else 0.0) - nodes[j, c])
     n = active.shape[0]
-    part, right = np.empty((n, n)), np.empty(n)
+    part, right = np.zeros((n, n)), np.empty(n)
     for i in range(n):
         right[i] = g[active[i]] + pull[active[i]]
-        for j in range(n):
-            part[i, j] = N[active[i], active[j]]
+        row = N[active[i]]
+        for j in range(i, n):
+            part[i, j] = row[active[j]]
         part[i, i] += precision[active[i]]
     return part, right
