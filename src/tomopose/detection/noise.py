@@ -156,11 +156,11 @@ def correlation(u: Array, v: Array, normalised: Array) -> Array:
     rim = np.ones(rho.shape, dtype=bool)
     rim[1:-1, 1:-1] = False
     rho += max(-float(np.average(rho[rim], weights=count[rim])), 0.0)
-    # Autocorrelations of correlated noise vary by sqrt(sum rho^2 / n) themselves; they end where a ring of lags is 0.
-    chance = math.sqrt(float((near**2).sum()) / count[REACH, REACH])
     lag = np.abs(np.arange(-REACH, REACH + 1))
     ring = np.maximum(lag[:, None], lag)
-    over = next(r for r in range(2, REACH + 1) if r == REACH or rho[ring == r].mean() < 2.0 * chance / math.sqrt(8 * r))
+    # They end where a ring of lags is 0; of its 8 r lags half repeat the others, and neighbours vary together.
+    chance = float(near.sum()) / math.sqrt(count[REACH, REACH])
+    over = next(r for r in range(3, REACH + 1) if r == REACH or rho[ring == r].mean() < 2.0 * chance / math.sqrt(4 * r))
     rho[ring >= over] = 0.0
     return rho
 
