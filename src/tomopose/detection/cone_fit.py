@@ -271,7 +271,7 @@ def _curvature_precision(rim: Rim, active: npt.NDArray[np.intp]) -> Array:
 
     With z_k the estimate of c_k without prior in its standard deviations, the share p_k of the evidence that node k is
     one of the few (a normal of variance 1 + BENT against one of variance 1) weighs what z_k^2 shows above its noise;
-    all nodes have in common what the others' mean square shows above it.
+    all nodes have in common what the others' mean square shows above what chance may do.
     """
     kept, rim.precision = rim.precision, rim.precision.copy()
     rim.precision[2::3] = 0.0
@@ -285,7 +285,8 @@ def _curvature_precision(rim: Rim, active: npt.NDArray[np.intp]) -> Array:
     V, c = X[np.arange(at.size), np.arange(at.size)], rim.nodes[:, 2] + X[:, -1]
     z2 = np.where(V > 0, c**2 / np.where(V > 0, V, 1.0), 0.0)
     p = 1.0 / (1.0 + (1.0 / FEW_BENT - 1.0) * math.sqrt(1.0 + BENT) * np.exp(-0.5 * z2 * BENT / (1.0 + BENT)))
-    common = max(float(np.sum((1.0 - p) * (z2 - 1.0)) / max(np.sum(1.0 - p), 1.0)), LEAST_TAU2)
+    count = float(np.sum(1.0 - p))
+    common = max(evident(float(np.sum((1.0 - p) * z2)) / max(count, 1.0), count) - 1.0, LEAST_TAU2)
     own = p * np.maximum(z2 - 1.0, 0.0) * V
     smooth = (np.roll(own, 1) + 2 * own + np.roll(own, -1)) / 4
     return np.where(V > 0, 1.0 / np.maximum(smooth + common * V, 1e-300), 0.0)
