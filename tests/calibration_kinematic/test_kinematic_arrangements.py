@@ -25,7 +25,7 @@ from tomopose.calibration.residuals import whiteners
 from tomopose.calibration.run_changes import find_change
 from tomopose.calibration.slack import slacks
 from tomopose.calibration.solve import calibrate
-from tomopose.errors import InputError, NotObservableError
+from tomopose.errors import InputError, NotConvergedError, NotObservableError
 from tomopose.geometry.projection import project, project_ball
 from tomopose.geometry.rotations import R_y, R_z, rotation_angle_between
 from tomopose.manipulator.inverse import inverse_poses
@@ -253,6 +253,24 @@ def test_no_table_under_a_standing_object(rng: np.random.Generator) -> None:
         calibrate_inverse(scanner, replace(poses, alpha=np.ones(len(poses))), observations)
     with pytest.raises(InputError, match="d_SD_sigma"):
         calibrate_inverse(scanner, poses, observations, d_SD_sigma=-1.0)
+
+
+def test_a_failed_fit_of_a_moving_scanner_says_what_it_was(rng: np.random.Generator, monkeypatch: Any) -> None:
+    """What was reached without an optimum keeps the arrangement, for its report and its matrices."""
+    from tomopose.calibration import inverse_arrangement
+
+    scanner, poses, T_MT, ball = carm(rng)
+    x = project_ball(scanner, T_HT=T_MT, T_MH=inverse_poses(poses).T_MH, t=ball)
+    observations = BallObservations.from_sigma(x, SIGMA, pose_id=poses.pose_id)
+    reached = calibrate_inverse(scanner, poses, observations)
+
+    def fails(*_: Any, **__: Any) -> Any:
+        raise NotConvergedError("no optimum", calibration=replace(reached, manipulator={}, converged=False))
+
+    monkeypatch.setattr(inverse_arrangement, "calibrate", fails)
+    with pytest.raises(NotConvergedError) as error:
+        calibrate_inverse(scanner, poses, observations)
+    assert error.value.calibration.manipulator == {"arrangement": "moving-scanner"}
 
 
 # -- several balls in every view --------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from tomopose.calibration.residuals import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.result import Calibration
 from tomopose.calibration.rivals import RIVALS_OF_MOVING_SCANNER
 from tomopose.calibration.solve import calibrate
-from tomopose.errors import InputError, NotObservableError
+from tomopose.errors import InputError, NotConvergedError, NotObservableError
 from tomopose.geometry.scanner import Scanner
 from tomopose.manipulator.error_models import MOVING_SCANNER, corrected_poses
 from tomopose.manipulator.inverse import InverseManipulator, inverse_poses
@@ -69,7 +69,12 @@ def calibrate_inverse(
     if distances and (model == "rigid" or (model == "auto" and machine is None)):
         raise InputError("distances between balls serve models with the manipulator's errors; give its geometry")
     turned = inverse_poses(poses)
-    found = calibrate(scanner, turned, observations, model="rigid", hypotheses=RIVALS_OF_MOVING_SCANNER, **options)
+    try:
+        found = calibrate(scanner, turned, observations, model="rigid", hypotheses=RIVALS_OF_MOVING_SCANNER, **options)
+    except NotConvergedError as error:
+        if isinstance(error.calibration, Calibration):
+            error.calibration = replace(error.calibration, manipulator={"arrangement": MOVING_SCANNER})
+        raise
     if machine is not None or d_SD_sigma or model not in ("auto", "rigid"):
         found = calibrate_kinematic(
             scanner, turned, observations, rigid=found,

@@ -114,7 +114,7 @@ def matrices(
         at_home = None if home is None else real.poses.T_MH[int(real.poses.index_of([home])[0])]
         result, notes = tp.projection_matrices(cal, scan, home=at_home, **given), real.notes
     wanted = None if commands is None else turn(tp.commands_for(cal.manipulator, scan))
-    inputs = [calibration, poses, *(p for p in (source_poses, scanner) if p is not None)]
+    inputs = [calibration, poses, *(p for p in (source_poses, scanner, manipulator) if p is not None)]
     tp.write_matrices(
         out, result, provenance=provenance(inputs=inputs, arguments=arguments(binning=binning, home=home)), force=force
     )
