@@ -12,6 +12,7 @@ from ball_images import frame, noisy, scene_of
 from tomopose import Scanner
 from tomopose.detection import detect, detect_image
 from tomopose.errors import InputError, ShapeError
+from tomopose.io.images import open_images, write_tiff
 from tomopose.observations import BallObservations
 
 N = 256
@@ -172,3 +173,36 @@ def test_an_interrupted_run_goes_on_from_its_journal(
     seen = detect(changed, scanner, journal=journal)
     assert (seen.status or ())[:2] == ("few photons", "ok")
     assert same(seen.select(range(1, 6)), detect(changed, scanner).select(range(1, 6)))
+
+
+def test_the_next_image_is_asked_for_before_the_present_one_is_measured(
+    run: tuple[Scanner, list[np.ndarray], np.ndarray],
+) -> None:
+    scanner, images, truth = run
+    events: list[tuple[str, int]] = []
+
+    class Asked(Stack):
+        def fetch(self, i: int, v0: int, v1: int) -> None:
+            events.append(("fetch", i))
+            at = truth[i, 1]
+            assert 0 <= v0 < at - 25
+            assert at + 25 < v1 <= images[i].shape[0]
+
+        def region(self, i: int, v0: int, v1: int, u0: int, u1: int) -> np.ndarray:
+            events.append(("region", i))
+            return super().region(i, v0, v1, u0, u1)
+
+    detect(Asked(images), scanner, predicted=truth)
+    order = [events.index(("fetch", i)) for i in range(1, 6)]
+    assert order == sorted(order)
+    assert all(events.index(("fetch", i)) < events.index(("region", i - 1)) for i in range(1, 6))
+
+
+def test_files_that_are_asked_for_beforehand_read_the_same(
+    run: tuple[Scanner, list[np.ndarray], np.ndarray], tmp_path: Path
+) -> None:
+    scanner, images, truth = run
+    for i, image in enumerate(images):
+        write_tiff(tmp_path / f"pose_{i}.tif", image)
+    asked = detect(open_images(tmp_path, rows="top-first"), scanner, predicted=truth)
+    assert same(asked, detect(images, scanner, predicted=truth))

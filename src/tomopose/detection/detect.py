@@ -13,7 +13,7 @@ import numpy as np
 from tomopose.detection.diagnosis import fault_of_input
 from tomopose.detection.executors import ordered_map
 from tomopose.detection.flags import MOTION, expected_radius, motion_length
-from tomopose.detection.image import detect_image
+from tomopose.detection.image import detect_image, region_about
 from tomopose.detection.journal import append, fingerprint, read_journal
 from tomopose.detection.lag import ghost_share
 from tomopose.detection.result import BallImage
@@ -74,8 +74,9 @@ def detect(
     Parameters
     ----------
     images:         arrays [v, u] (row index = v), counts or transmission, or a lazy sequence with `len`, `[i]` and
-                    `region(i, v0, v1, u0, u1)` (and, if it has them, `names` and a bad-pixel `mask`), which is read in
-                    the worker processes.  One image is handled at a time.
+                    `region(i, v0, v1, u0, u1)` (and, if it has them, `names`, a bad-pixel `mask`, and `fetch(i, v0,
+                    v1)` that asks the system for rows beforehand), which is read in the worker processes.  One image
+                    is handled at a time.
     scanner:        intrinsic geometry.
     ball_diameter:  nominal, mm.
     pose_id:        names of the rows; without it, the images' indices.
@@ -113,9 +114,22 @@ def detect(
     work = partial(_row, scanner=scanner, ball_diameter=ball_diameter, mask=getattr(images, "mask", None),
                    settings=settings, keyed=path is not None)  # fmt: skip
 
+    def fetch(i: int) -> None:
+        """Lets image i come from the disk while the one before is measured, where the images can be asked to."""
+        if not (lazy and hasattr(images, "fetch") and i < total):
+            return
+        rows, columns = _Lazy(images, i).shape
+        v0, v1 = 0, rows
+        if where is not None and np.isfinite(where[i]).all():
+            expected = expected_radius(scanner, ball_diameter)
+            v0, v1, *_ = region_about(where[i] - _origin_of(origin, i), (rows, columns), scanner, expected)
+        if v0 < v1:
+            images.fetch(i, v0, v1)
+
     def tasks() -> Iterator[tuple[Any, ...]]:
         source = (_Lazy(images, i) for i in range(total)) if lazy else images
         for i, image in enumerate(source):
+            fetch(i + 1)
             name = names[i] if names is not None else str(i)
             at = None if where is None else (where[i] if i < len(where) else None)
             yield image, name, None if at is None else tuple(at), _origin_of(origin, i), done.get(name)

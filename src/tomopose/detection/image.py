@@ -70,14 +70,8 @@ def detect_image(
     if predicted is None or not np.isfinite(np.asarray(predicted, dtype=np.float64)).all():
         return _in_region(image, scanner, (0, shape[0], 0, shape[1]), (u_0, v_0), mask, expected, None)
     at = np.asarray(predicted, dtype=np.float64) - (u_0, v_0)
-    p = math.sqrt(scanner.p_u * scanner.p_v)
     for reach in (REGION_REACH, 2 * REGION_REACH + 1):
-        half_u = (reach * expected + REGION_MARGIN) * p / scanner.p_u
-        half_v = (reach * expected + REGION_MARGIN) * p / scanner.p_v
-        box = (
-            max(int(at[1] - half_v), 0), min(int(at[1] + half_v) + 2, shape[0]),
-            max(int(at[0] - half_u), 0), min(int(at[0] + half_u) + 2, shape[1]),
-        )  # fmt: skip
+        box = region_about(at, shape, scanner, expected, reach)
         if box[1] - box[0] < SMALLEST_IMAGE or box[3] - box[2] < SMALLEST_IMAGE:
             raise BallNotFoundError(f"the predicted position ({predicted[0]:.1f}, {predicted[1]:.1f}) is out of view")
         try:
@@ -86,6 +80,22 @@ def detect_image(
             if reach > REGION_REACH or box == (0, shape[0], 0, shape[1]):
                 raise
     raise AssertionError("unreachable")
+
+
+def region_about(
+    at: Array, shape: tuple[int, int], scanner: Scanner, expected: float, reach: float = REGION_REACH
+) -> tuple[int, int, int, int]:  # fmt: skip
+    """(v0, v1, u0, u1) of the part of an image that is searched about a predicted position `at` (u, v) in it.
+
+    expected: radius, px of size sqrt(p_u p_v); reach: in radii.  The part is empty where the position is out of view.
+    """
+    p = math.sqrt(scanner.p_u * scanner.p_v)
+    half_u = (reach * expected + REGION_MARGIN) * p / scanner.p_u
+    half_v = (reach * expected + REGION_MARGIN) * p / scanner.p_v
+    return (
+        max(int(at[1] - half_v), 0), min(int(at[1] + half_v) + 2, shape[0]),
+        max(int(at[0] - half_u), 0), min(int(at[0] + half_u) + 2, shape[1]),
+    )  # fmt: skip
 
 
 def _whole_numbers(origin: tuple[int, int]) -> tuple[int, int]:

@@ -46,6 +46,17 @@ def read_block(path: Path, offset: int, shape: tuple[int, int], dtype: np.dtype[
     return image[r0:r1, c0:c1].astype(dtype.newbyteorder("="), copy=False)
 
 
+def fetch_ahead(path: Path, offset: int, count: int) -> None:
+    """Asks the system for bytes of a file without waiting for them: a hint, which some systems cannot be given."""
+    if not hasattr(os, "posix_fadvise"):
+        return
+    try:
+        with open(path, "rb") as stream:
+            os.posix_fadvise(stream.fileno(), offset, count, os.POSIX_FADV_WILLNEED)
+    except OSError:
+        return  # reading the file will say what is wrong with it
+
+
 def unreadable(path: Path, error: OSError) -> FileError:
     """The FileError for a file that the system does not let us read."""
     why = "does not exist" if error.errno == errno.ENOENT else f"cannot be read: {error.strerror or error}"

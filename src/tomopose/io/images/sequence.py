@@ -75,6 +75,12 @@ class ImageSequence:
             part = np.array(self.source.read(k, (v0, v1, u0, u1)), order="C")
         return part if self.correction is None else self.correction.transmission(part, v0, u0)
 
+    def fetch(self, i: int, v0: int, v1: int) -> None:
+        """Asks the system for rows v0 to v1 of image i, where the format allows, so that they are there when read."""
+        if hasattr(self.source, "fetch"):
+            n_v = self.shape[0]
+            self.source.fetch(self.index[i], *((n_v - v1, n_v - v0) if self.rows == "top-first" else (v0, v1)))
+
     @overload
     def __getitem__(self, i: int) -> Image: ...
     @overload

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tomopose.errors import EngineMissingError, FileError, InputError
-from tomopose.io.images.frames import Band, Image, read_block, require_grey, require_one_kind, unreadable
+from tomopose.io.images.frames import Band, Image, fetch_ahead, read_block, require_grey, require_one_kind, unreadable
 
 LOSSLESS = {1: "none", 5: "LZW", 8: "deflate", 32773: "PackBits", 32946: "deflate", 34925: "LZMA", 50000: "Zstandard"}
 PHOTOMETRIC_GREY = (0, 1)
@@ -44,6 +44,12 @@ class TiffSource:
         if frame.offset is not None:
             return read_block(frame.path, frame.offset, self.shape, frame.dtype, band)
         return _decode(frame, band)
+
+    def fetch(self, index: int, r0: int, r1: int) -> None:
+        """Asks the system for file rows r0 to r1 of a plain frame, without waiting for them."""
+        frame, row = self.frames[index], self.shape[1] * self.dtype.itemsize
+        if frame.offset is not None:
+            fetch_ahead(frame.path, frame.offset + r0 * row, (r1 - r0) * row)
 
 
 def open_tiff(paths: list[Path], names: list[str]) -> TiffSource:
