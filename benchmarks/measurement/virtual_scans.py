@@ -1,7 +1,7 @@
 """How often stated 95 % intervals of lengths hold the truth over virtual scans: simulated, reconstructed, measured.
 
     NUMBA_NUM_THREADS=1 nice -n 10 python benchmarks/measurement/virtual_scans.py [--objects 40] [--runs 6]
-                                                                                  [--sets 12] [--draws 20]
+                                                                                  [--sets 12] [--draws 20] [--seed 0]
 
 Two balls and a block of aluminium, 96^3 voxels of 0.1 mm, 120 views of the tilted scan of eq. (11), CNR about 15 in
 the volume.  Each object lies elsewhere by a part of a voxel and has sizes of its own; its scans differ by noise alone.
@@ -111,10 +111,12 @@ def main():
     parser.add_argument("--runs", type=int, default=6)
     parser.add_argument("--sets", type=int, default=12)
     parser.add_argument("--draws", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0, help="of the first set of draws")
     parser.add_argument("--snr", type=float, default=150.0)
     args = parser.parse_args()
     nominal = VirtualPart(BALLS, BLOCK, SIDES, args.snr)
-    sets = [simulated_errors(nominal.run, nominal.plan, GRID, draws=args.draws, seed=k) for k in range(args.sets)]
+    sets = [simulated_errors(nominal.run, nominal.plan, GRID, draws=args.draws, seed=args.seed + k)
+            for k in range(args.sets)]
     rows = {}
     for k in range(args.objects):
         part = VirtualPart(*random_object(np.random.default_rng(np.random.SeedSequence([2, k]))), args.snr)
