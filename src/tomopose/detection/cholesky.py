@@ -19,7 +19,7 @@ def solve(N: Array, B: Array) -> Array:
 
     BallNotFoundError where N is not positive definite.
     """
-    good, X = _solve(N, B)
+    good, X = _solve(N, np.ascontiguousarray(B))
     if not good:
         raise BallNotFoundError("the rim does not determine a ball (singular normal equations)")
     return np.asarray(X)

@@ -215,8 +215,12 @@ def by_sector(u, v, value, rim, low, high, thin_from, k, edges, more):  # type: 
         if cell[i] >= 0:
             source[place[cell[i]]] = i
             place[cell[i]] += 1
+    new_u, new_v, new_value, share, left = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n, np.int64)
     new_rim = np.empty((6 + more, n))
+    for at in range(n):
+        i = source[at]
+        new_u[at], new_v[at], new_value[at], share[at], left[at] = u[i], v[i], value[i], part[i], cell[i] // shells
     for c in range(6):
         for at in range(n):
             new_rim[c, at] = rim[c, source[at]]
-    return u[source], v[source], value[source], new_rim, cell[source] // shells, part[source], first
+    return new_u, new_v, new_value, new_rim, left, share, first

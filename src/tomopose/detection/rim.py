@@ -26,7 +26,7 @@ from tomopose.units import Array
 
 ENOUGH = 1500
 """Pixels that the way from the finder's circle to the fit's neighbourhood is gone with."""
-MANY, NEAR = 8000, 8.0
+MANY, NEAR = 8000.0, 8.0
 """Of more pixels than this, every second one is left out that lies farther than NEAR px outside the rim."""
 LINEAR = 0.02
 """Largest move, px, after which distances are updated to first order: what is left out is LINEAR^2 / 2 radius."""
@@ -226,7 +226,7 @@ class Rim:
         """
         N, g = self.normal(active)
         full = np.zeros(FIRST_NODE + 3 * self.n_nodes)
-        full[active] = solve(N, g[:, None])[:, 0]
+        full[active] = solve(N, g.reshape(-1, 1))[:, 0]
         if not math.isfinite(full.sum()):
             raise BallNotFoundError("the rim does not determine a ball (no finite step)")
         largest = float(np.abs(full[:3]).max())
