@@ -23,8 +23,8 @@ from tomopose.units import Array
 
 def cone_radius(scanner: Scanner, x_D: Array, gamma: float) -> float:
     """Radius of the silhouette in px: gamma / |grad theta| at the centre, mean over directions."""
-    G = _metric(scanner, x_D)
-    return float(gamma / np.sqrt(np.sqrt(np.linalg.det(G))) / math.sqrt(scanner.p_u * scanner.p_v))
+    (uu, uv), (_, vv) = _metric(scanner, x_D).tolist()
+    return float(gamma / math.sqrt(math.sqrt(uu * vv - uv * uv)) / math.sqrt(scanner.p_u * scanner.p_v))
 
 
 def cone_angle(scanner: Scanner, x_D: Array, radius: float) -> float:
@@ -34,38 +34,44 @@ def cone_angle(scanner: Scanner, x_D: Array, radius: float) -> float:
 
 def cone_eccentricity(scanner: Scanner, x_D: Array, gamma: float) -> float:
     """By how much, px, the silhouette may deviate from the circle about x_D: its axes differ, its centre is not x_D."""
-    p = np.array([scanner.p_u, scanner.p_v])
-    axes = gamma / np.sqrt(np.linalg.eigvalsh(_metric(scanner, x_D)))
-    away = (silhouette_ellipse(scanner, x_D, gamma)[0] - x_D) * p
-    return float(axes[0] - axes[1] + np.hypot(*away)) / math.sqrt(scanner.p_u * scanner.p_v)
+    small, large, _ = _principal(_metric(scanner, x_D))
+    away = silhouette_ellipse(scanner, x_D, gamma)[0] - x_D
+    off = math.hypot(away[0] * scanner.p_u, away[1] * scanner.p_v)
+    return (gamma / math.sqrt(small) - gamma / math.sqrt(large) + off) / math.sqrt(scanner.p_u * scanner.p_v)
 
 
 def _metric(scanner: Scanner, x_D: Array) -> Array:
     """theta^2 near the axis as a quadratic form in detector mm, (2, 2)."""
     inverse = np.linalg.inv(scanner.K)
-    m = inverse @ np.array([x_D[0], x_D[1], 1.0])
-    length = np.linalg.norm(m)
-    J = inverse[:, :2] / np.array([scanner.p_u, scanner.p_v]) / length
-    J = J - np.outer(m, m @ J) / length**2
-    return np.asarray(J.T @ J)
+    m = inverse @ (x_D[0], x_D[1], 1.0)
+    square = m @ m
+    J = inverse[:, :2] / (scanner.p_u, scanner.p_v)
+    along = m @ J
+    return np.asarray((J.T @ J - along[:, None] * along / square) / square)
+
+
+def _principal(M: Array) -> tuple[float, float, float]:
+    """Eigenvalues of a symmetric (2, 2), the smaller first, and the direction of the smaller's vector in [0, pi)."""
+    (uu, uv), (_, vv) = M.tolist()
+    mean, half = (uu + vv) / 2, math.hypot((uu - vv) / 2, uv)
+    return mean - half, mean + half, (math.atan2(2 * uv, uu - vv) / 2 + math.pi / 2) % math.pi
 
 
 def silhouette_ellipse(scanner: Scanner, x_D: Array, gamma: float) -> tuple[Array, float, float, float]:
     """The silhouette as an ellipse in pixels: centre (2,), semi-major, semi-minor, angle of the major axis from u.
 
-    x' (m m' - cos(gamma)^2 I) x = 0 with rays x = K^-1 [u, v, 1].
+    x' (cos(gamma)^2 I - m m') x = 0 with rays x = K^-1 [u, v, 1].
     """
     inverse = np.linalg.inv(scanner.K)
-    m = inverse @ np.array([x_D[0], x_D[1], 1.0])
-    m = m / np.linalg.norm(m)
-    C = inverse.T @ (np.outer(m, m) - math.cos(gamma) ** 2 * np.eye(3)) @ inverse
-    centre = -np.linalg.solve(C[:2, :2], C[:2, 2])
-    value = C[2, 2] + C[:2, 2] @ centre
-    eigenvalues, vectors = np.linalg.eigh(C[:2, :2])
-    axes = np.sqrt(-value / eigenvalues)
-    major = int(np.argmax(axes))
-    angle = math.atan2(vectors[1, major], vectors[0, major]) % math.pi
-    return centre, float(axes[major]), float(axes[1 - major]), angle
+    m = inverse @ (x_D[0], x_D[1], 1.0)
+    n = inverse.T @ m / math.sqrt(m @ m)
+    C = math.cos(gamma) ** 2 * (inverse.T @ inverse) - n[:, None] * n
+    (uu, uv, u), (_, vv, v), (_, _, one) = C.tolist()
+    determinant = uu * vv - uv * uv
+    centre = np.array([(uv * v - vv * u) / determinant, (uv * u - uu * v) / determinant])
+    value = -(one + u * centre[0] + v * centre[1])
+    small, large, angle = _principal(C[:2, :2])
+    return centre, math.sqrt(value / small), math.sqrt(value / large), angle
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
