@@ -62,6 +62,7 @@ _HOME = {
     "read_poses": "tomopose.io",
     "read_scanner": "tomopose.io",
     "read_scene": "tomopose.simulation.scene",
+    "read_twin": "tomopose.manipulator.twin_file",
     "read_volume": "tomopose.io.volume_files",
     "reconstruct": "tomopose.reconstruction",
     "run_from_ctsimu": "tomopose.simulation.ctsimu",

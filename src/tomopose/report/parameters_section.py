@@ -8,6 +8,7 @@ import numpy as np
 
 from tomopose.calibration.result import Calibration, Parameter
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.error_models import moving_scanner
 from tomopose.report.page import Block, Section, Table, Words
 from tomopose.report.words import NOT_GIVEN, cell, heading, meaning, small_unit
 from tomopose.units import value_with_uncertainty
@@ -54,8 +55,12 @@ def parameters_section(calibration: Calibration) -> Section:
             ]
         )
     )
-    return Section(title="What was found", lead="How the manipulator sits on the table, and where the ball is.",
-                   blocks=blocks)
+    carried = moving_scanner(calibration.manipulator) or calibration.manipulator.get("kind") == "twin"
+    lead = (
+        "How the scanner sits on the moved plate, and where the ball stands." if carried
+        else "How the manipulator sits on the table, and where the ball is."
+    )
+    return Section(title="What was found", lead=lead, blocks=blocks)
 
 
 def _parameter_table(parameters: Sequence[Parameter], *, title: str, words: str) -> Table:
