@@ -25,7 +25,7 @@ def without_outliers(s, image, value, clear, least, weight):  # type: ignore[no-
         if abs(s[i]) > clear:
             size[m] = abs(image[i] - value[i])
             m += 1
-    most = max(8 * 1.4826 * median(size, m), least) if m > 0 else np.inf
+    most = max(8 * 1.4826 * median(size[:m]), least) if m > 0 else np.inf
     out = np.full(s.shape[0], weight)
     for i in range(s.shape[0]):
         if abs(s[i]) > clear and abs(image[i] - value[i]) > most:

@@ -42,7 +42,7 @@ def check_circle(image, u, v, low, high, sign, aspect, noise, tightness):  # typ
                 m += 1
         if m < max(12.0, 0.4 * n_seen):
             return nothing
-        strong = median(part, m)
+        strong = median(part[:m])
         if strong < SIGNIFICANT * noise:
             return nothing
         n = 0
@@ -50,7 +50,7 @@ def check_circle(image, u, v, low, high, sign, aspect, noise, tightness):  # typ
             if seen[k] and strength[k] > 0.2 * strong:
                 x[n], y[n], part[n] = edge[k] * COS[k], edge[k] * SIN[k], edge[k]
                 n += 1
-        cx, cy, radius = _robust_circle(x, y, n, median(part, n))
+        cx, cy, radius = _robust_circle(x[:n], y[:n], median(part[:n]))
         if not (0.5 * low < radius < 2.0 * high) or math.sqrt(cx * cx + cy * cy) > 0.8 * high:
             return nothing
         tolerance = max(tightness * radius, 0.6)
@@ -68,7 +68,7 @@ def check_circle(image, u, v, low, high, sign, aspect, noise, tightness):  # typ
         if turn >= 2 and math.sqrt(cx * cx + cy * cy) < 0.1:
             break
     complete = np.sum(deviation[:n] < tolerance) / max(n_seen, 1)
-    if median(deviation, n) > 0.5 * tolerance:
+    if median(deviation[:n]) > 0.5 * tolerance:
         complete *= 0.5
     return True, u, v, radius, complete, n_seen / RAYS, _disc_contrast(image, u, v, radius, sign, aspect)
 
@@ -112,16 +112,15 @@ def ray_edges(image, u, v, low, high, sign, aspect, edge, strength, seen):  # ty
 
 
 @njit(cache=True)
-def _robust_circle(x, y, n, start):  # type: ignore[no-untyped-def]
-    """(u, v, radius) through most of the first n points: least squares, points that disagree given less weight
-    (Cauchy)."""
-    cx, cy, radius = 0.0, 0.0, start
+def _robust_circle(x, y, start):  # type: ignore[no-untyped-def]
+    """(u, v, radius) through most of the points: least squares, points that disagree given less weight (Cauchy)."""
+    n, cx, cy, radius = x.shape[0], 0.0, 0.0, start
     deviation, size = np.empty(n), np.empty(n)
     for turn in range(ROBUST_TURNS):
         for k in range(n):
             deviation[k] = math.sqrt((x[k] - cx) ** 2 + (y[k] - cy) ** 2) - radius
             size[k] = abs(deviation[k])
-        per_scale = 0.5 / max(median(size, n), 0.05)
+        per_scale = 0.5 / max(median(size), 0.05)
         total, mx, my, ms, xx, xy, yy, xs, ys = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(n):
             w = 1.0 / (1.0 + (deviation[k] * per_scale) ** 2)
@@ -155,23 +154,18 @@ def _robust_circle(x, y, n, start):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _disc_contrast(image, u, v, radius, sign, aspect):  # type: ignore[no-untyped-def]
     """How much darker (sign +1) the middle is than the surroundings; not positive for a ring or a hole."""
-    disc, around = np.empty(2 * RAYS), np.empty(RAYS)
-    n_disc = 0
-    for r, every in ((0.0, RAYS), (0.25, 6), (0.5, 3)):
-        n_disc += _on_circle(image, u, v, r * radius, aspect, every, disc[n_disc:])
-    n_around = _on_circle(image, u, v, radius + max(0.15 * radius, 2.0), aspect, 1, around)
+    sample, n_disc, n_around = np.empty((2, 2 * RAYS)), 0, 0
+    for r in (0.25 * radius, 0.5 * radius, radius + max(0.15 * radius, 2.0)):
+        for k in range(RAYS):
+            i, j = round(u + r * COS[k]), round(v + r * SIN[k] / aspect)
+            if not (0 <= i < image.shape[1] and 0 <= j < image.shape[0]):
+                continue
+            if r < radius:
+                sample[0, n_disc] = image[j, i]
+                n_disc += 1
+            else:
+                sample[1, n_around] = image[j, i]
+                n_around += 1
     if n_disc == 0 or n_around == 0:
         return 0.0
-    return sign * (median(around, n_around) - median(disc, n_disc))
-
-
-@njit(cache=True)
-def _on_circle(image, u, v, radius, aspect, every, out):  # type: ignore[no-untyped-def]
-    """Fills in the nearest pixels on a circle, one ray in `every`; returns how many lie in the image."""
-    n = 0
-    for k in range(0, RAYS, every):
-        i, j = round(u + radius * COS[k]), round(v + radius * SIN[k] / aspect)
-        if 0 <= i < image.shape[1] and 0 <= j < image.shape[0]:
-            out[n] = image[j, i]
-            n += 1
-    return n
+    return sign * (median(sample[1, :n_around]) - median(sample[0, :n_disc]))

@@ -204,9 +204,8 @@ def _is_transparent(rim: Rim) -> bool:
 @njit(cache=True)
 def middle_value(values):  # type: ignore[no-untyped-def]
     """Median of the values, and its standard deviation."""
-    n = values.shape[0]
-    middle = median(values.copy(), n)
-    return middle, 1.8 * median(np.abs(values - middle), n) / math.sqrt(n)
+    middle = median(values.copy())
+    return middle, 1.8 * median(np.abs(values - middle)) / math.sqrt(values.shape[0])
 
 
 def _choose_kappa(rim: Rim, spread: float, start: Array) -> None:

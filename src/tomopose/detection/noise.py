@@ -9,7 +9,7 @@ import numpy.typing as npt
 from numba import njit
 from scipy.ndimage import convolve
 
-from tomopose.detection.order import median
+from tomopose.detection.order import median, select
 from tomopose.units import Array
 
 REACH = 5
@@ -67,14 +67,14 @@ def weights(s, residual, model, first, sigma, level, white, floor, parameters, o
         for i in range(first[j], first[j + 1]):
             part[m] = square[i]
             m += s[i] > 3 * sigma
-        limit[j] = median(part, m) if m > 0 else -1.0
+        limit[j] = median(part[:m]) if m > 0 else -1.0
         largest = max(largest, limit[j])
     for j in range(k):
         limit[j] = outlier**2 * ((limit[j] if limit[j] >= 0.0 else largest) / NORMAL_MEDIAN + floor)
     for i in range(n):
         part[n_rim] = square[i]
         n_rim += abs(s[i]) <= 3 * sigma
-    rim_limit = outlier**2 * median(part, n_rim) / NORMAL_MEDIAN if n_rim > 0 else 0.0
+    rim_limit = outlier**2 * median(part[:n_rim]) / NORMAL_MEDIAN if n_rim > 0 else 0.0
     used = np.empty(n)
     mean, level_of, count = np.zeros(k), np.zeros(k), np.zeros(k)
     n_core, n_inner, core, inner, core_level, inner_level = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -101,14 +101,14 @@ def weights(s, residual, model, first, sigma, level, white, floor, parameters, o
     if n_core <= 20:
         n_core, core, core_level = n_inner, inner, inner_level
     mean = mean / np.maximum(count - parameters, 1.0)
-    v_in, level_in = (core / n_core, core_level / n_core) if n_core > 0 else (np.median(mean[enough]), white)
+    v_in, level_in = (core / n_core, core_level / n_core) if n_core > 0 else (median(mean[enough]), white)
     v_in = max(v_in, floor)
     share = (level_of / np.maximum(count, 1.0) - level_in) / (level - level_in)
-    usual = np.sort(mean[enough])[np.sum(enough) // 4]
+    usual = select(mean[enough], np.sum(enough) // 4)
     # What a sector's variance would be at the mean level of the background.
     for j in range(k):
         mean[j] /= min(max((v_in + (usual - v_in) * share[j]) / max(usual, 1e-300), 0.5), 2.0)
-    v_out, spread = _quiet(mean[enough], np.median(count[enough]))
+    v_out, spread = _quiet(mean[enough], median(count[enough]))
     v_out = max(v_out, floor)
     weight, chi2 = np.empty(n), np.zeros(k)
     per_level = 1.0 / (level - level_in)

@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
 
 
 @njit(cache=True)
-def select(values, n, k):  # type: ignore[no-untyped-def]
-    """The k-th smallest of values[:n], k from 0; afterwards values[:k] are no larger and values[k:n] no smaller.
+def select(values, k):  # type: ignore[no-untyped-def]
+    """The k-th smallest value, k from 0; afterwards values[:k] are no larger and values[k:] no smaller.
 
     NaN counts as large, or is returned.
     """
-    low, high = 0, n
+    low, high = 0, values.shape[0]
     while True:
         pivot = values[(low + high) // 2]
         if math.isnan(pivot):
@@ -43,12 +44,8 @@ def select(values, n, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def median(values, n):  # type: ignore[no-untyped-def]
-    """Median of values[:n], the mean of the middle two where n is even."""
-    upper = select(values, n, n // 2)
-    if n % 2 == 1:
-        return upper
-    lower = values[0]
-    for i in range(1, n // 2):
-        lower = max(lower, values[i])
-    return 0.5 * (lower + upper)
+def median(values):  # type: ignore[no-untyped-def]
+    """Median, the mean of the middle two where their number is even."""
+    half = values.shape[0] // 2
+    upper = select(values, half)
+    return upper if values.shape[0] % 2 == 1 else 0.5 * (np.max(values[:half]) + upper)

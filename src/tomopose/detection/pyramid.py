@@ -81,7 +81,7 @@ def _votes(image, square, threshold):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _peaks(votes, reach):  # type: ignore[no-untyped-def]
-    """((n, 3), n): u, v, votes of the highest local maxima of votes summed over (2 reach + 1)^2 pixels."""
+    """(n, 3): u, v, votes of the highest local maxima of votes summed over (2 reach + 1)^2 pixels."""
     rows, columns = votes.shape
     total = np.zeros((rows, columns), np.float32)
     for j in range(rows):
@@ -91,13 +91,12 @@ def _peaks(votes, reach):  # type: ignore[no-untyped-def]
                     for x in range(max(0, i - reach), min(columns, i + reach + 1)):
                         total[y, x] += votes[j, i]
     out = np.zeros((PEAKS, 3))
-    n = 0
     for j in range(rows):
         for i in range(columns):
             here = total[j, i]
-            if here >= LEAST_VOTES and (n < PEAKS or here > out[n - 1, 2]) and _is_highest(total, i, j):
-                n = _ranked(out, n, np.array([i, j, here]))
-    return out, n
+            if here >= LEAST_VOTES and here > out[PEAKS - 1, 2] and _is_highest(total, i, j):
+                _rank(out, np.array([i, j, here]))
+    return out[: np.sum(out[:, 2] > 0.0)]
 
 
 @njit(cache=True)
@@ -124,29 +123,25 @@ def circle_centres(level):  # type: ignore[no-untyped-def]
     # For normal noise |grad|^2 is exponential with mean 2 s^2: its lower quartile is 0.575 s^2, whatever the edges, and
     # s^2 = 2 sigma^2 for the difference of two pixels.
     sample = square[1:-1:3, 1:-1:3].copy().ravel()
-    noise = select(sample, sample.shape[0], sample.shape[0] // 4) / 0.575 / 2
+    noise = select(sample, sample.shape[0] // 4) / 0.575 / 2
     top = np.max(square)
     threshold = np.float32(max(36.0 * noise, 2e-5 * top))
-    n = 0
     if top > threshold:
         votes = _votes(level, square, threshold)
         for polarity in range(2):
             for band in range(len(BANDS)):
-                peaks, size = _peaks(votes[polarity, band], 1 if band == 0 else 2)
-                for k in range(size):
-                    row = np.array([peaks[k, 0], peaks[k, 1], band, polarity, peaks[k, 2]])
-                    n = _ranked(found, n, row)
-    return math.sqrt(noise), found[:n]
+                for u, v, count in _peaks(votes[polarity, band], 1 if band == 0 else 2):
+                    _rank(found, np.array([u, v, band, polarity, count]))
+    return math.sqrt(noise), found[: np.sum(found[:, 4] > 0.0)]
 
 
 @njit(cache=True)
-def _ranked(table, n, row):  # type: ignore[no-untyped-def]
-    """Inserts the row into the first n of a table that its last column orders downwards; returns the new n."""
-    if n == table.shape[0] and not row[-1] > table[n - 1, -1]:
-        return n
-    place = min(n, table.shape[0] - 1)
+def _rank(table, row):  # type: ignore[no-untyped-def]
+    """Inserts the row into a table that its last column orders downwards; the last row falls out."""
+    place = table.shape[0]
     while place > 0 and table[place - 1, -1] < row[-1]:
-        table[place] = table[place - 1]
+        if place < table.shape[0]:
+            table[place] = table[place - 1]
         place -= 1
-    table[place] = row
-    return min(n + 1, table.shape[0])
+    if place < table.shape[0]:
+        table[place] = row
