@@ -137,6 +137,7 @@ def calibrate(
     from dataclasses import replace
 
     import tomopose as tp
+    from tomopose.calibration.ball_size import require_ball_size, size_ratio
     from tomopose.cli.job import (
         calibration_summary,
         exit_code,
@@ -187,6 +188,12 @@ def calibrate(
         if not isinstance(error.calibration, tp.Calibration):
             raise
         result = error.calibration
+    # where the scanner moves, the chain runs through the inverse poses
+    shown = tp.inverse_poses(sequence) if moving or twins is not None else sequence
+    if stack is not None and twins is None and result.verdict != "rejected":
+        size = require_ball_size(size_ratio(result, shown, observed, ball_diameter), ball_diameter)
+        if size:
+            say.note(f"note: {size}")
     made = provenance(
         inputs=[scanner, poses, *(p for p in (observations, manipulator, twin, source_poses) if p is not None)],
         arguments=arguments(model=model, free=free, fix=fix, distance=distance, ball_diameter_mm=ball_diameter,
@@ -195,8 +202,6 @@ def calibrate(
                             d_sd_sigma_mm=distance_sigma or None),
     )
     result = replace(result, provenance=made)
-    # where the scanner moves, the report's chain runs through the inverse poses, as the calibration's does
-    shown = tp.inverse_poses(sequence) if moving or twins is not None else sequence
     write_calibration_folder(out, result, observed, shown, images=stack, force=force)
     summary, lines = calibration_summary(result)
     if "kind" in result.manipulator:
