@@ -142,6 +142,7 @@ def calibrate(
         calibration_summary,
         exit_code,
         image_source,
+        note_missing_flat,
         observe,
         open_for,
         require_free_folder,
@@ -169,6 +170,7 @@ def calibrate(
             say, image_source(str(images)), geometry, sequence,
             dark=dark, flat=flat, dataset=dataset, rows=rows, raw=raw,
         )
+        note_missing_flat(say, flat)
         observed = observe(say, geometry, stack, sequence, ball_diameter=ball_diameter, workers=workers)
     given: dict[str, Any] = {"model": model, "free": names(free), "fix": names(fix), "distances": bars}
     try:

@@ -58,7 +58,7 @@ def detect(
     An image that cannot be measured is listed with the reason, never silently measured.
     """
     import tomopose as tp
-    from tomopose.cli.job import executor_of, image_source, observe, open_for
+    from tomopose.cli.job import executor_of, image_source, note_missing_flat, observe, open_for
     from tomopose.files import require_absent
 
     say = Say(json=as_json, quiet=quiet)
@@ -67,6 +67,7 @@ def detect(
     sequence = None if poses is None else tp.read_poses(poses)
     stack = open_for(say, image_source(images), geometry, sequence, dark=dark, flat=flat, dataset=dataset, rows=rows,
                          raw=raw)
+    note_missing_flat(say, flat)
     with executor_of(dask) as executor:
         found = observe(
             say, geometry, stack, sequence, ball_diameter=ball_diameter, workers=workers, executor=executor,

@@ -65,6 +65,13 @@ def open_for(
     return images if poses is None else images.select(tp.pair_images(poses, images))
 
 
+def note_missing_flat(say: Say, flat: str | None) -> None:
+    """Says what becomes of radiographs that nobody has corrected."""
+    if flat is None:
+        say.note("note: no flat field given; unless the radiographs are corrected already, pixel gains count as noise "
+                 "and the background is fitted round the ball alone")
+
+
 @contextlib.contextmanager
 def executor_of(dask: str | None) -> Iterator[Any]:
     """A client of the dask scheduler at that address, closed afterwards; None without an address."""
