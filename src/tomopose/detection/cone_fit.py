@@ -321,16 +321,17 @@ def _result(
     block = (rows[:, :m] + rows[:, :m].T) / 2
     s, sigma = rim.rim[0], rim.shape[3]
     clean = (rim.weight > 0) & (noise.excess < MISFIT * noise.scatter)[rim.left]
-    normalised = rim.residual * np.sqrt(rim.weight)
+    normalised = unexplained = rim.residual * np.sqrt(rim.weight)
     if np.count_nonzero(rho) > 1:
         effect = influence(rim.jacobian, rim.left, rim.weight, _scattered(rim, active, rows), rim.n_nodes)
         from_priors = block - effect.T @ effect
         if apart:
-            effect = effect * across(s, normalised, clean)[:, None]
+            spread = across(s, normalised, clean)
+            effect, unexplained = effect * spread[:, None], normalised / spread
         block = sandwich(rim.u, rim.v, effect, rho) + from_priors
     near = (np.abs(s) <= 3 * sigma) & clean if apart else (s > 0) & (rim.weight > 0)
     if near.any():
-        block = block * evident(float((normalised[near] ** 2).mean()), float(np.count_nonzero(near)))
+        block = block * evident(float((unexplained[near] ** 2).mean()), float(np.count_nonzero(near)))
     block[:2, :2] += doubt
     all_near = (np.abs(s) <= 3 * sigma) & (rim.weight > 0)
     rim_rms = math.sqrt(float((rim.residual[all_near] ** 2).mean())) if all_near.any() else 0.0

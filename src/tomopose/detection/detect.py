@@ -172,9 +172,14 @@ def _row(
         try:
             return row | _numbers(detect_image(image, scanner, **options))
         except DetectionError as error:
-            raise fault_of_input(image, scanner, **options) or error from error
+            # no name here for what is found: it would hold this frame, and with it the image, until the next collection
+            return _refused(row, fault_of_input(image, scanner, **options) or error)
     except (TomoposeError, OSError, ValueError, EOFError) as error:
-        return row | {"reason": _reason(error), "fault": type(error).__name__}
+        return _refused(row, error)
+
+
+def _refused(row: Row, error: Exception) -> Row:
+    return row | {"reason": _reason(error), "fault": type(error).__name__}
 
 
 def _numbers(ball: BallImage) -> Row:

@@ -101,7 +101,7 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
                        holds=bool(share["circular scan"].min() < 1)),
         ]
         progress(k + 1, len(HALF_SIZE) + 2)
-    _, views, _ = tuy_discs.PLAN[scale]
+    _, views = tuy_discs.PLAN[scale]
     discs = {}
     for k, (name, scan) in enumerate(
         (("circular scan", circular_scan(views)),

@@ -27,8 +27,8 @@ MAGNIFICATION = 5.3
 RADIUS, THICKNESS, PITCH, DISCS = 14.0, 1.5, 3.0, 17
 """mm.  At the outermost disc the planes that are missed lean by up to 5 degrees: over the discs' diameter that is more
 than a gap."""
-PLAN = {"small": (8, 126, 3), "paper": (4, 504, 3)}
-"""Scale -> detector binning, views, sweeps of SART."""
+PLAN = {"small": (8, 126), "paper": (4, 504)}
+"""Scale -> detector binning, views."""
 AWAY = 0.36
 """Distance, mm, from a face within which a sharp edge may ring."""
 SUBROWS = (-1 / 3, 0.0, 1 / 3)
@@ -54,7 +54,7 @@ def disc_integrals(P: Array, scanner: Scanner, faces: Sequence[tuple[float, floa
 
 def disc_profile(scan: PoseSequence, scale: Scale) -> dict[str, Any]:
     """z (n,), value on the discs' axis (mean of a core of 4 mm radius) over the true one, and the section y = 0."""
-    binning, _, sweeps = PLAN[scale]
+    binning, _ = PLAN[scale]
     fine = paper_scanner(MAGNIFICATION)
     alpha = np.zeros(len(scan)) if scan.alpha is None else scan.alpha
     P = eq5_matrices(fine, T_HT=demo_setup().T_HT, T_MH=scan.T_MH, alpha=alpha)
@@ -69,8 +69,7 @@ def disc_profile(scan: PoseSequence, scale: Scale) -> dict[str, Any]:
     n, n_z = int(2 * (RADIUS + 3.0) / side), int(2 * half_height / side)
     grid = VoxelGrid(shape=(n_z, n, n), spacing=side)
     volume = reconstruct(
-        images, matrices, grid, images_are="line-integrals", engine="cpu", algorithm="sart", iterations=sweeps,
-        consistency="off",
+        images, matrices, grid, images_are="line-integrals", engine="cpu", algorithm="fdk", consistency="off",
     )
     x = grid.origin[0] + side * np.arange(n)
     core = np.hypot(x[:, None], x[None, :]) < 4.0
