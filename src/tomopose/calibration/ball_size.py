@@ -6,34 +6,16 @@ centres as another mount would. The ball's diameter is a length of its own, and 
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from tomopose.calibration.result import Calibration
 from tomopose.errors import InputError
-from tomopose.geometry.scanner import Scanner
+from tomopose.geometry.silhouette import silhouette_ellipse
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
-from tomopose.units import Array
 
 NOTED, WRONG = 0.005, 0.02
 """Relative differences of size from which one is told, and from which a value must be wrong."""
-
-
-def silhouette_size(scanner: Scanner, x_S: Any, radius: float) -> Array:
-    """sqrt(a b), (n,) mm: semi-axes of the ellipse that a ball at x_S (n, 3) mm in S throws on the panel.
-
-    A cone of half-angle gamma whose axis leans by theta against the panel's normal cuts the plane at distance D in
-    a = D sin gamma cos gamma / (cos^2 theta - sin^2 gamma), b = D sin gamma / sqrt(cos^2 theta - sin^2 gamma).
-    Panel tilts of some degrees change the product by their square and are left out.
-    """
-    x_S = np.asarray(x_S, dtype=np.float64)
-    distance = np.linalg.norm(x_S, axis=-1)
-    sin2 = (radius / distance) ** 2
-    left = (x_S[..., 2] / distance) ** 2 - sin2
-    ab = scanner.d_SD**2 * sin2 * np.sqrt(1.0 - sin2) / left**1.5
-    return np.asarray(np.sqrt(ab), dtype=np.float64)
 
 
 def size_ratio(
@@ -49,10 +31,14 @@ def size_ratio(
     scanner, row = calibration.scanner, {name: k for k, name in enumerate(observations.pose_id)}
     (ball,) = calibration.balls.values()
     T_MS = scanner.T_WS @ scanner.T_TW(np.asarray(chain.alpha)) @ calibration.T_HT @ chain.T_MH
-    a, b = (np.asarray(axis)[[row[name] for name in calibration.pose_id]]
-            for axis in (observations.semi_major, observations.semi_minor))
-    measured = np.sqrt(scanner.p_u * scanner.p_v * a * b)
-    return float(np.nanmedian(measured / silhouette_size(scanner, T_MS.apply(ball), ball_diameter / 2.0)))
+    sizes = []
+    for x_S, name in zip(T_MS.apply(ball), calibration.pose_id, strict=True):
+        x = scanner.K @ x_S
+        gamma = np.arcsin(ball_diameter / 2.0 / np.linalg.norm(x_S))
+        _, major, minor, _ = silhouette_ellipse(scanner, x[:2] / x[2], gamma)
+        k = row[name]
+        sizes.append(observations.semi_major[k] * observations.semi_minor[k] / (major * minor))
+    return float(np.sqrt(np.nanmedian(sizes)))
 
 
 def require_ball_size(ratio: float, ball_diameter: float) -> str | None:

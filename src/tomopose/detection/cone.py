@@ -18,6 +18,7 @@ import numpy as np
 from numba import njit
 
 from tomopose.geometry.scanner import Scanner
+from tomopose.geometry.silhouette import principal_axes, silhouette_ellipse
 from tomopose.units import Array
 
 
@@ -34,7 +35,7 @@ def cone_angle(scanner: Scanner, x_D: Array, radius: float) -> float:
 
 def cone_eccentricity(scanner: Scanner, x_D: Array, gamma: float) -> float:
     """By how much, px, the silhouette may deviate from the circle about x_D: its axes differ, its centre is not x_D."""
-    small, large, _ = _principal(_metric(scanner, x_D))
+    small, large, _ = principal_axes(_metric(scanner, x_D))
     away = silhouette_ellipse(scanner, x_D, gamma)[0] - x_D
     off = math.hypot(away[0] * scanner.p_u, away[1] * scanner.p_v)
     return (gamma / math.sqrt(small) - gamma / math.sqrt(large) + off) / math.sqrt(scanner.p_u * scanner.p_v)
@@ -48,30 +49,6 @@ def _metric(scanner: Scanner, x_D: Array) -> Array:
     J = inverse[:, :2] / (scanner.p_u, scanner.p_v)
     along = m @ J
     return np.asarray((J.T @ J - along[:, None] * along / square) / square)
-
-
-def _principal(M: Array) -> tuple[float, float, float]:
-    """Eigenvalues of a symmetric (2, 2), the smaller first, and the direction of the smaller's vector in [0, pi)."""
-    (uu, uv), (_, vv) = M.tolist()
-    mean, half = (uu + vv) / 2, math.hypot((uu - vv) / 2, uv)
-    return mean - half, mean + half, (math.atan2(2 * uv, uu - vv) / 2 + math.pi / 2) % math.pi
-
-
-def silhouette_ellipse(scanner: Scanner, x_D: Array, gamma: float) -> tuple[Array, float, float, float]:
-    """The silhouette as an ellipse in pixels: centre (2,), semi-major, semi-minor, angle of the major axis from u.
-
-    x' (cos(gamma)^2 I - m m') x = 0 with rays x = K^-1 [u, v, 1].
-    """
-    inverse = np.linalg.inv(scanner.K)
-    m = inverse @ (x_D[0], x_D[1], 1.0)
-    n = inverse.T @ m / math.sqrt(m @ m)
-    C = math.cos(gamma) ** 2 * (inverse.T @ inverse) - n[:, None] * n
-    (uu, uv, u), (_, vv, v), (_, _, one) = C.tolist()
-    determinant = uu * vv - uv * uv
-    centre = np.array([(uv * v - vv * u) / determinant, (uv * u - uu * v) / determinant])
-    value = -(one + u * centre[0] + v * centre[1])
-    small, large, angle = _principal(C[:2, :2])
-    return centre, math.sqrt(value / small), math.sqrt(value / large), angle
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")

@@ -9,13 +9,13 @@ from typing import Any, Protocol
 import numpy as np
 from numba import njit
 
-from tomopose.detection.cone import silhouette_ellipse
 from tomopose.detection.cone_fit import ConeFit, fit_cone
 from tomopose.detection.find import Candidate, find_ball
 from tomopose.detection.flags import expected_radius, flags_of, saturated_share
 from tomopose.detection.result import BallImage
 from tomopose.errors import BallNotFoundError, BallTruncatedError, DetectionError, InputError, ShapeError
 from tomopose.geometry.scanner import Scanner
+from tomopose.geometry.silhouette import silhouette_ellipse
 from tomopose.units import Array
 
 NATIVE = ("uint8", "uint16", "float32", "float64")
