@@ -57,11 +57,6 @@ def scale_bars(texts: list[str] | None) -> dict[tuple[int, int], tuple[float, fl
     return bars or None
 
 
-def forward_of(machine: Any) -> Any:
-    """The forward kinematics of a robot with joint values, for tables that hold nothing else."""
-    return machine.forward if hasattr(machine, "joints") else None
-
-
 def require_arrangement(
     arrangement: str, distance_sigma: float, twin: Path | None, source_poses: Path | None, manipulator: Path | None
 ) -> bool:
@@ -141,6 +136,7 @@ def calibrate(
     from tomopose.cli.job import (
         calibration_summary,
         exit_code,
+        forward_of,
         image_source,
         note_missing_flat,
         observe,

@@ -1,4 +1,4 @@
-"""The steps that `detect`, `calibrate` and `demo` share: radiographs to observations, and a result to its folder."""
+"""The steps that verbs share: tables and radiographs to observations, and a result to its folder."""
 
 from __future__ import annotations
 
@@ -63,6 +63,11 @@ def open_for(
     for warning in images.warnings:
         say.note(f"note: {warning}")
     return images if poses is None else images.select(tp.pair_images(poses, images))
+
+
+def forward_of(machine: Any) -> Any:
+    """The forward kinematics of a robot with joint values, for tables that hold nothing else."""
+    return machine.forward if hasattr(machine, "joints") else None
 
 
 def note_missing_flat(say: Say, flat: str | None) -> None:

@@ -82,9 +82,9 @@ def matrices(
     import numpy as np
 
     import tomopose as tp
-    from tomopose.cli.calibrate import forward_of
+    from tomopose.cli.job import forward_of
     from tomopose.files import require_absent
-    from tomopose.manipulator.error_models import machines_of
+    from tomopose.manipulator.error_models import correction, machines_of, moving_scanner
     from tomopose.manipulator.twin_file import read_twin
     from tomopose.provenance import provenance
 
@@ -106,8 +106,6 @@ def matrices(
         source = tp.read_poses(source_poses, forward=forward_of(other))
         result, notes = tp.twin_matrices(cal, scan, source, **given), twin_notes(cal, scan, source)
     else:
-        from tomopose.manipulator.error_models import correction, moving_scanner
-
         turn = tp.inverse_poses if moving_scanner(cal.manipulator) else lambda table: table
         scan = turn(scan)
         real = correction(cal.manipulator, scan)
