@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from tomopose import BallObservations, PoseSequence, RigidTransform, Scanner, calibrate
-from tomopose.calibration.exact import d_rms_exact
+from tomopose.calibration.records.truth import d_rms_exact
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import eq5_matrices, project_ball

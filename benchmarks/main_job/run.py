@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 import tomopose as tp
-from tomopose.calibration.apply import projection_matrices
+from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import eq5_matrices, project, project_ball
 from tomopose.geometry.rotations import exp_rotation, rotation_angle_between

@@ -15,7 +15,7 @@ from unittest import mock
 import numpy as np
 from manipulator_cases import Experiment, hexapod_experiment, scan_error
 
-from tomopose.calibration.kinematic import calibrate_kinematic
+from tomopose.calibration.identified.calibrate import calibrate_kinematic
 from tomopose.calibration.solve import calibrate
 from tomopose.manipulator.hexapod import Hexapod
 from tomopose.manipulator.virtual import typical_hexapod
@@ -34,7 +34,7 @@ def errors(e: Experiment) -> list[float]:
         x = scan_error(cal, e)
         return [x.shared, x.u_shared]
 
-    with mock.patch("tomopose.calibration.file_trust.SHARES", (1.0,)):
+    with mock.patch("tomopose.calibration.identified.geometry_prior.SHARES", (1.0,)):
         doubted = found(e.machine)
     return [*doubted, *found(replace(e.machine, scale_sigma=0.0, geometry_sigma=0.0)), *found(e.machine)]
 

@@ -19,13 +19,13 @@ from run import HEXAPOD, ROBOT, WORN
 from twin_cases import twin_experiment, twin_scan_error
 
 from tomopose import BallObservations, Frame, PoseSequence, RigidTransform
-from tomopose.calibration.apply import projection_matrices
-from tomopose.calibration.inverse_arrangement import calibrate_inverse
-from tomopose.calibration.kinematic import calibrate_kinematic
-from tomopose.calibration.kinematic_trajectory import object_points, rms_px, without_object_pose
-from tomopose.calibration.multi_ball_pnp import poses_of_views
+from tomopose.calibration.arrangements.moving_scanner import calibrate_inverse
+from tomopose.calibration.arrangements.multi_sphere import poses_of_views
+from tomopose.calibration.arrangements.twin_robots import calibrate_twin
+from tomopose.calibration.identified.calibrate import calibrate_kinematic
+from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.calibration.solve import calibrate
-from tomopose.calibration.twin_robots import calibrate_twin
+from tomopose.calibration.uncertainty.trajectory import object_points, rms_px, without_object_pose
 from tomopose.geometry.projection import eq5_matrices, project, project_ball
 from tomopose.manipulator.inverse import inverse_poses
 from tomopose.manipulator.virtual import Disturbance, real_motion

@@ -31,7 +31,7 @@ from manipulator_cases import (
     scan_error,
 )
 
-from tomopose.calibration.kinematic import calibrate_kinematic
+from tomopose.calibration.identified.calibrate import calibrate_kinematic
 from tomopose.calibration.solve import calibrate
 from tomopose.manipulator.virtual import Disturbance, typical_hexapod, typical_robot
 

@@ -18,10 +18,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "measurement"))
 from blurred_shapes import as_volume, balls_on_a_lattice, balls_volume
 
-from tomopose.measurement.edge_search import EdgeSettings
-from tomopose.measurement.fits import fit_sphere
-from tomopose.measurement.histogram import grey_levels
-from tomopose.measurement.surface import surface
+from tomopose.measurement.features.fits import fit_sphere
+from tomopose.measurement.surface.edges import EdgeSettings
+from tomopose.measurement.surface.grey_levels import grey_levels
+from tomopose.measurement.surface.surface import surface
 from tomopose.volume import VoxelGrid
 
 VOXEL, SIGMA, NOISE = 0.1482, 1.0, 0.05

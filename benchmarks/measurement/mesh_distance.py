@@ -1,6 +1,6 @@
 """Half a million points with known distances against a mesh of about 137,000 triangles.
 
-    python benchmarks/measurement/mesh_distance.py [--points 500000]
+    python benchmarks/measurement/mesh/distance.py [--points 500000]
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "measurem
 from test_measurement_comparison import box
 
 from tomopose.geometry.rotations import exp_rotation
-from tomopose.measurement.meshes import Mesh, signed_distances
+from tomopose.measurement.mesh.mesh import Mesh, signed_distances
 
 
 def main():

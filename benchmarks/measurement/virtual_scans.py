@@ -26,10 +26,10 @@ from tomopose.measurement.budget import budget
 from tomopose.measurement.measure import measure
 from tomopose.measurement.plan import plan_from
 from tomopose.measurement.uncertainty import Simulated
-from tomopose.simulation.detector import expose
+from tomopose.simulation.detector.detector import expose
 from tomopose.simulation.run import signal
-from tomopose.simulation.scene import scene_from
-from tomopose.studies.simulated_uncertainty import simulated_errors
+from tomopose.simulation.scene.scene import scene_from
+from tomopose.uncertainty.virtual_scans import simulated_errors
 
 VOXEL, SIZE, VIEWS = 0.1, 96, 120
 BALLS, RADIUS = np.array([[-2.13, 0.21, 1.55], [2.07, -0.34, 1.72]]), 1.2

@@ -16,12 +16,12 @@ import numpy as np
 from tomopose.measurement.measure import measure
 from tomopose.measurement.probing import sphere_pattern
 from tomopose.reconstruction import PAPER, reconstruct
-from tomopose.simulation.standard import sphere_centres, sphere_diameters
-from tomopose.studies.result import DEFAULT_SEED
-from tomopose.studies.section6_blur import blur_of
-from tomopose.studies.section6_scan import WHITE, Numbers, Path, Radiographs, grid_of, scan_with
-from tomopose.studies.section6_standard import CAP_DEG, POINTS, SEARCH_VOXELS, measure_standard, plan_for
-from tomopose.studies.section6_tables import PERIODS, rms, waves
+from tomopose.simulation.objects.sphere_standard import sphere_centres, sphere_diameters
+from tomopose.studies.parts.result import DEFAULT_SEED
+from tomopose.studies.section6.blur import blur_of
+from tomopose.studies.section6.scan import WHITE, Numbers, Path, Radiographs, grid_of, scan_with
+from tomopose.studies.section6.standard import CAP_DEG, POINTS, SEARCH_VOXELS, measure_standard, plan_for
+from tomopose.studies.section6.tables import PERIODS, rms, waves
 from tomopose.volume import Volume
 
 NUMBERS = Numbers(

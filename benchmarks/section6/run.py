@@ -12,12 +12,12 @@ import time
 from pathlib import Path
 
 from tomopose.provenance import provenance
-from tomopose.studies import section6
+from tomopose.studies.parts.result import DEFAULT_SEED, StudyResult
+from tomopose.studies.parts.steps import Steps
+from tomopose.studies.parts.writing import write_study
 from tomopose.studies.registry import PAPER
-from tomopose.studies.result import DEFAULT_SEED, StudyResult
-from tomopose.studies.section6_scan import Numbers
-from tomopose.studies.steps import Steps
-from tomopose.studies.writing import write_study
+from tomopose.studies.section6 import study as section6
+from tomopose.studies.section6.scan import Numbers
 
 
 def main() -> None:

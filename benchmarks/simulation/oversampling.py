@@ -12,9 +12,9 @@ from numba import njit
 from scipy.special import ndtr
 
 from tomopose.geometry.frames import Frame
-from tomopose.simulation.materials import attenuation
+from tomopose.simulation.physics.materials import attenuation
+from tomopose.simulation.projector.view import View
 from tomopose.simulation.run import SimulatedRun
-from tomopose.simulation.view import View
 
 
 @njit

@@ -21,21 +21,21 @@ from oversampling import ball_image, edge_error, shift_between
 
 from tomopose import PoseSequence, RigidTransform, Scanner
 from tomopose.geometry.frames import Frame
-from tomopose.simulation.build import simulate
-from tomopose.simulation.detector import Detector, expose
-from tomopose.simulation.gvxr import path_images
-from tomopose.simulation.materials import attenuation, from_formula
-from tomopose.simulation.mesh import Mesh, MeshSolid, mesh_paths
-from tomopose.simulation.noise import add_photon_noise, frame_key
-from tomopose.simulation.raster import mesh_path_image
-from tomopose.simulation.rays import compile_solids, path_lengths
+from tomopose.simulation.detector.detector import Detector, expose
+from tomopose.simulation.detector.noise import add_photon_noise, frame_key
+from tomopose.simulation.objects.mesh import Mesh, MeshSolid, mesh_paths
+from tomopose.simulation.objects.shapes import Solid, sphere
+from tomopose.simulation.objects.specimen import specimen_mesh
+from tomopose.simulation.objects.sphere_standard import multi_sphere_standard
+from tomopose.simulation.objects.tessellate import tessellate
+from tomopose.simulation.physics.materials import attenuation, from_formula
+from tomopose.simulation.projector.gvxr import path_images
+from tomopose.simulation.projector.raster import mesh_path_image
+from tomopose.simulation.projector.rays import compile_solids, path_lengths
+from tomopose.simulation.projector.view import View, Window
 from tomopose.simulation.run import SimulatedRun, simulate_ball_run, transmission
-from tomopose.simulation.scene import read_scene
-from tomopose.simulation.shapes import Solid, sphere
-from tomopose.simulation.specimen import specimen_mesh
-from tomopose.simulation.standard import multi_sphere_standard
-from tomopose.simulation.tessellate import tessellate
-from tomopose.simulation.view import View, Window
+from tomopose.simulation.scene.build import simulate
+from tomopose.simulation.scene.scene import read_scene
 
 SCENES = Path(__file__).resolve().parents[2] / "examples/scenes"
 FULL = Scanner(d_SD=1500.0, d_SR=283.5, p_u=0.2, p_v=0.2, u_0=1021.37, v_0=1026.81, n_u=2048, n_v=2048)

@@ -14,10 +14,12 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from tomopose.calibration.estimate import best_fit
-from tomopose.calibration.fit import Fit, blocks, jacobian
-from tomopose.calibration.parameters import free_parameters
-from tomopose.calibration.pose_field import (
+from tomopose.calibration.model.covariance import inverse_information
+from tomopose.calibration.model.parameters import free_parameters
+from tomopose.calibration.model.problem import Problem, pair
+from tomopose.calibration.rigid.estimate import best_fit
+from tomopose.calibration.rigid.fit import Fit, blocks, jacobian
+from tomopose.calibration.rigid.pose_error_field import (
     PoseField,
     estimate_pose_field,
     field_covariance,
@@ -25,8 +27,6 @@ from tomopose.calibration.pose_field import (
     lever_blocks,
     solve_with_field,
 )
-from tomopose.calibration.problem import Problem, pair
-from tomopose.calibration.uncertainty import inverse_information
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import exp_rotation, log_rotation
 from tomopose.geometry.scanner import Scanner

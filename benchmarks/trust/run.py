@@ -21,16 +21,16 @@ from robot_camera import described, study
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from tomopose.calibration.estimate import best_fit, solve
-from tomopose.calibration.fit import Fit, blocks, jacobian, minimise
-from tomopose.calibration.hypotheses import ranked
-from tomopose.calibration.monte_carlo import draw
-from tomopose.calibration.parameters import free_parameters
-from tomopose.calibration.pose_noise import PoseNoise, total_covariance
-from tomopose.calibration.problem import Problem, pair
-from tomopose.calibration.propagate import length_sigma, matrix_point_jacobian
+from tomopose.calibration.checks.convention_tests import ranked
+from tomopose.calibration.model.covariance import inverse_information
+from tomopose.calibration.model.parameters import free_parameters
+from tomopose.calibration.model.problem import Problem, pair
+from tomopose.calibration.rigid.estimate import best_fit, solve
+from tomopose.calibration.rigid.fit import Fit, blocks, jacobian, minimise
+from tomopose.calibration.rigid.pose_noise import PoseNoise, total_covariance
 from tomopose.calibration.solve import calibrate
-from tomopose.calibration.uncertainty import inverse_information
+from tomopose.calibration.uncertainty.monte_carlo import draw
+from tomopose.calibration.uncertainty.propagation import length_sigma, matrix_point_jacobian
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import project_ball
 from tomopose.geometry.rotations import log_rotation
@@ -139,7 +139,7 @@ def coverage(runs: int) -> None:
 
 
 def _length_errors(cal: object, scan: PoseSequence, x: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    from tomopose.calibration.propagate import apparent_displacement
+    from tomopose.calibration.uncertainty.propagation import apparent_displacement
 
     B = apparent_displacement(cal, scan, x)  # type: ignore[arg-type]
     along = (x[1] - x[0]) / np.linalg.norm(x[1] - x[0])

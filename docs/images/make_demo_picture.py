@@ -12,9 +12,9 @@ import matplotlib
 import numpy as np
 
 import tomopose as tp
+from tomopose.report.figures.thumbnails import thumbnail
 from tomopose.report.gather import rotation_groups
 from tomopose.report.style import ACCENT, ALERT, INK, ROTATION_COLOURS, SOFT
-from tomopose.report.thumbnails import thumbnail
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from tomopose.report.study_page import figure_png
+from tomopose.report.pages.study_page import figure_png
 from tomopose.studies.registry import run_study
 
 FOLDER = Path(__file__).parent / "gallery"

@@ -10,7 +10,7 @@ from calibration_cases import BALL, MOUNT, SCANNER, mixed_poses, observe, paper_
 from scipy.spatial import ConvexHull
 
 import tomopose as tp
-from tomopose.calibration.ball_size import require_ball_size, size_ratio
+from tomopose.calibration.checks.ball_size import require_ball_size, size_ratio
 from tomopose.calibration.solve import calibrate
 from tomopose.errors import InputError
 

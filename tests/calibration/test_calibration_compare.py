@@ -8,14 +8,19 @@ import numpy as np
 import pytest
 from calibration_cases import BALL, MOUNT, SCANNER, SIGMA, mixed_poses, observe, paper_poses
 
-from tomopose.calibration.compare import compare
-from tomopose.calibration.estimate import best_fit
-from tomopose.calibration.history import append_history, control_chart, read_history
-from tomopose.calibration.parameters import free_parameters
-from tomopose.calibration.pose_field import PoseField, estimate_pose_field, field_covariance, solve_with_field
-from tomopose.calibration.problem import pair
+from tomopose.calibration.model.covariance import inverse_information
+from tomopose.calibration.model.parameters import free_parameters
+from tomopose.calibration.model.problem import pair
+from tomopose.calibration.records.compare import compare
+from tomopose.calibration.records.history import append_history, control_chart, read_history
+from tomopose.calibration.rigid.estimate import best_fit
+from tomopose.calibration.rigid.pose_error_field import (
+    PoseField,
+    estimate_pose_field,
+    field_covariance,
+    solve_with_field,
+)
 from tomopose.calibration.solve import calibrate
-from tomopose.calibration.uncertainty import inverse_information
 from tomopose.errors import InputError, SchemaVersionError
 from tomopose.observations import BallObservations
 

@@ -8,14 +8,14 @@ from calibration_cases import BALL, MOUNT, SCANNER, mixed_poses, observe, paper_
 from scipy.special import chdtri
 
 from tomopose import RigidTransform
-from tomopose.calibration.fit import Fit, blocks, minimise
-from tomopose.calibration.monte_carlo import draw, monte_carlo
-from tomopose.calibration.parameters import free_parameters
-from tomopose.calibration.pose_noise import PoseNoise, total_covariance
-from tomopose.calibration.problem import pair
-from tomopose.calibration.propagate import length_sigma, matrix_point_jacobian, object_sigma
+from tomopose.calibration.model.covariance import inverse_information
+from tomopose.calibration.model.parameters import free_parameters
+from tomopose.calibration.model.problem import pair
+from tomopose.calibration.rigid.fit import Fit, blocks, minimise
+from tomopose.calibration.rigid.pose_noise import PoseNoise, total_covariance
 from tomopose.calibration.solve import calibrate
-from tomopose.calibration.uncertainty import inverse_information
+from tomopose.calibration.uncertainty.monte_carlo import draw, monte_carlo
+from tomopose.calibration.uncertainty.propagation import length_sigma, matrix_point_jacobian, object_sigma
 from tomopose.geometry.projection import eq5_matrices, project
 from tomopose.geometry.rotations import exp_rotation
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from calibration_cases import BALL, MOUNT, SCANNER, mixed_poses, observe, paper_poses
 
-from tomopose.calibration.hypotheses import diagnose
-from tomopose.calibration.problem import pair
-from tomopose.calibration.rivals import RIVALS
+from tomopose.calibration.checks.convention_tests import diagnose
+from tomopose.calibration.checks.conventions import RIVALS
+from tomopose.calibration.model.problem import pair
 from tomopose.calibration.solve import calibrate
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import rotation_from_convention

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tomopose import RigidTransform
-from tomopose.calibration.residuals import SCANNER_COLUMNS, projection_blocks
+from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import project_ball
 from tomopose.geometry.rotations import exp_rotation

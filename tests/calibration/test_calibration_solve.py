@@ -9,10 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tomopose import RigidTransform
-from tomopose.calibration.apply import projection_matrices
-from tomopose.calibration.estimate import best_fit
-from tomopose.calibration.parameters import free_parameters
-from tomopose.calibration.problem import pair
+from tomopose.calibration.model.parameters import free_parameters
+from tomopose.calibration.model.problem import pair
+from tomopose.calibration.projection_matrices import projection_matrices
+from tomopose.calibration.rigid.estimate import best_fit
 from tomopose.calibration.solve import calibrate
 from tomopose.errors import InputError, NotObservableError
 from tomopose.geometry.frames import Frame

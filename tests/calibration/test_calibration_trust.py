@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from calibration_cases import BALL, MOUNT, SCANNER, SIGMA, mixed_poses, observe, paper_poses
 
-from tomopose.calibration.estimate import solve, with_pose_noise
-from tomopose.calibration.fit import minimise
-from tomopose.calibration.parameters import free_parameters
-from tomopose.calibration.problem import pair
+from tomopose.calibration.model.parameters import free_parameters
+from tomopose.calibration.model.problem import pair
+from tomopose.calibration.rigid.estimate import solve, with_pose_noise
+from tomopose.calibration.rigid.fit import minimise
 from tomopose.calibration.solve import calibrate
 from tomopose.errors import InputError
 from tomopose.files import plain
@@ -147,7 +147,7 @@ def test_all_parameters_can_be_freed_with_priors():
 
 
 def test_translation_scale_is_applied_to_a_scan():
-    from tomopose.calibration.apply import projection_matrices
+    from tomopose.calibration.projection_matrices import projection_matrices
 
     poses = mixed_poses(n=80)
     stretched = replace(poses, T_MH=replace(poses.T_MH, t=1.001 * poses.T_MH.t))

@@ -10,27 +10,27 @@ import pytest
 from manipulator_cases import SCANNER, Experiment, experiment, hexapod_experiment, mixed_poses, tilted_scan
 
 from tomopose import BallObservations, Frame, PoseSequence, RigidTransform, Scanner
-from tomopose.calibration.apply import projection_matrices
-from tomopose.calibration.inverse_arrangement import calibrate_inverse, view_distances
-from tomopose.calibration.kinematic import calibrate_kinematic
-from tomopose.calibration.kinematic_design import plan_kinematic
-from tomopose.calibration.kinematic_fit import fit_model
-from tomopose.calibration.kinematic_solve import KinematicProblem, State, linearise, solve_map
-from tomopose.calibration.kinematic_trajectory import object_points, rms_px, without_object_pose
-from tomopose.calibration.model_choice import blocks_of, judge
-from tomopose.calibration.multi_ball_pnp import pose_from_balls, poses_of_views, self_calibrated_balls
-from tomopose.calibration.parameters import free_parameters
-from tomopose.calibration.problem import pair
-from tomopose.calibration.residuals import whiteners
-from tomopose.calibration.run_changes import find_change
-from tomopose.calibration.slack import slacks
+from tomopose.calibration.arrangements.moving_scanner import calibrate_inverse, view_distances
+from tomopose.calibration.arrangements.multi_sphere import pose_from_balls, poses_of_views, self_calibrated_balls
+from tomopose.calibration.identified.calibrate import calibrate_kinematic
+from tomopose.calibration.identified.fit import fit_model
+from tomopose.calibration.identified.map_estimate import KinematicProblem, State, linearise, solve_map
+from tomopose.calibration.identified.model_selection import blocks_of, judge
+from tomopose.calibration.identified.pose_map import slacks
+from tomopose.calibration.identified.run_changes import find_change
+from tomopose.calibration.model.ball_projection import whiteners
+from tomopose.calibration.model.parameters import free_parameters
+from tomopose.calibration.model.problem import pair
+from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.calibration.solve import calibrate
+from tomopose.calibration.uncertainty.trajectory import object_points, rms_px, without_object_pose
 from tomopose.errors import InputError, NotConvergedError, NotObservableError
 from tomopose.geometry.projection import project, project_ball
 from tomopose.geometry.rotations import R_y, R_z, rotation_angle_between
 from tomopose.manipulator.inverse import inverse_poses
 from tomopose.manipulator.real_poses import Repeatability
 from tomopose.manipulator.virtual import Disturbance, real_motion, typical_hexapod
+from tomopose.planning.identified_design import plan_kinematic
 
 HEXAPOD = typical_hexapod()
 SIGMA = 0.015
@@ -257,7 +257,7 @@ def test_no_table_under_a_standing_object(rng: np.random.Generator) -> None:
 
 def test_a_failed_fit_of_a_moving_scanner_says_what_it_was(rng: np.random.Generator, monkeypatch: Any) -> None:
     """What was reached without an optimum keeps the arrangement, for its report and its matrices."""
-    from tomopose.calibration import inverse_arrangement
+    from tomopose.calibration.arrangements import moving_scanner
 
     scanner, poses, T_MT, ball = carm(rng)
     x = project_ball(scanner, T_HT=T_MT, T_MH=inverse_poses(poses).T_MH, t=ball)
@@ -267,7 +267,7 @@ def test_a_failed_fit_of_a_moving_scanner_says_what_it_was(rng: np.random.Genera
     def fails(*_: Any, **__: Any) -> Any:
         raise NotConvergedError("no optimum", calibration=replace(reached, manipulator={}, converged=False))
 
-    monkeypatch.setattr(inverse_arrangement, "calibrate", fails)
+    monkeypatch.setattr(moving_scanner, "calibrate", fails)
     with pytest.raises(NotConvergedError) as error:
         calibrate_inverse(scanner, poses, observations)
     assert error.value.calibration.manipulator == {"arrangement": "moving-scanner"}

@@ -17,18 +17,18 @@ from manipulator_cases import (
 )
 
 from tomopose import BallObservations, Calibration, Frame, RigidTransform
-from tomopose.calibration.apply import projection_matrices
-from tomopose.calibration.kinematic import calibrate_kinematic, machine_of
-from tomopose.calibration.kinematic_design import plan_kinematic
-from tomopose.calibration.kinematic_robot import robot_work
-from tomopose.calibration.kinematic_trajectory import object_points, rms_px, without_object_pose
-from tomopose.calibration.model_choice import EVIDENCE_GAIN
+from tomopose.calibration.identified.calibrate import calibrate_kinematic, machine_of
+from tomopose.calibration.identified.model_selection import EVIDENCE_GAIN
+from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.calibration.solve import calibrate
+from tomopose.calibration.uncertainty.trajectory import object_points, rms_px, without_object_pose
 from tomopose.errors import InputError
 from tomopose.geometry.projection import project_ball
 from tomopose.io.calibration_json import read_calibration, write_calibration
 from tomopose.manipulator.error_models import commands_for, corrected_poses
 from tomopose.manipulator.virtual import Disturbance, typical_hexapod, typical_robot
+from tomopose.planning.identified_design import plan_kinematic
+from tomopose.planning.robot_candidates import robot_work
 
 HEXAPOD, ROBOT = typical_hexapod(), typical_robot()
 

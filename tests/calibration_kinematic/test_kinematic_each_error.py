@@ -23,11 +23,11 @@ from manipulator_cases import (
 from scipy.optimize import least_squares
 
 from tomopose import Calibration, Frame, RigidTransform
-from tomopose.calibration.kinematic import calibrate_kinematic
-from tomopose.calibration.kinematic_solve import KinematicProblem, State, linearise, solve_map
-from tomopose.calibration.parameters import free_parameters
-from tomopose.calibration.problem import pair
-from tomopose.calibration.residuals import whiteners
+from tomopose.calibration.identified.calibrate import calibrate_kinematic
+from tomopose.calibration.identified.map_estimate import KinematicProblem, State, linearise, solve_map
+from tomopose.calibration.model.ball_projection import whiteners
+from tomopose.calibration.model.parameters import free_parameters
+from tomopose.calibration.model.problem import pair
 from tomopose.calibration.solve import calibrate
 from tomopose.errors import OutOfReachError, TrajectoryError
 from tomopose.geometry.rotations import R_x

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from manipulator_cases import Experiment, hexapod_experiment, scan_error
 
-from tomopose.calibration.file_trust import SHARES, averaged, believed
-from tomopose.calibration.kinematic import calibrate_kinematic
-from tomopose.calibration.kinematic_fit import ModelFit, fit_model
-from tomopose.calibration.kinematic_solve import KinematicProblem, State, solve_map
-from tomopose.calibration.parameters import free_parameters
-from tomopose.calibration.problem import pair
+from tomopose.calibration.identified.calibrate import calibrate_kinematic
+from tomopose.calibration.identified.fit import ModelFit, fit_model
+from tomopose.calibration.identified.geometry_prior import SHARES, averaged, believed
+from tomopose.calibration.identified.map_estimate import KinematicProblem, State, solve_map
+from tomopose.calibration.model.parameters import free_parameters
+from tomopose.calibration.model.problem import pair
 from tomopose.calibration.solve import calibrate
 from tomopose.manipulator.inverse import InverseManipulator
 from tomopose.manipulator.run_effects import with_run_effects

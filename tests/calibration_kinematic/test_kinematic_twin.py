@@ -10,8 +10,8 @@ import pytest
 from twin_cases import SCANNER, TwinExperiment, twin_experiment, twin_scan_error
 
 from tomopose import BallObservations, Calibration, projection_matrices
-from tomopose.calibration.twin_projection import twin_blocks, twin_view_matrices
-from tomopose.calibration.twin_robots import calibrate_twin, twin_matrices, view_geometry
+from tomopose.calibration.arrangements.twin_robots import calibrate_twin, twin_matrices, view_geometry
+from tomopose.calibration.model.twin_projection import twin_blocks, twin_view_matrices
 from tomopose.errors import InputError, NotObservableError, ShapeError
 from tomopose.geometry.projection import project, project_ball
 from tomopose.io.calibration_json import read_calibration, write_calibration

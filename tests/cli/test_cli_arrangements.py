@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import tomopose as tp
-from tomopose.calibration.kinematic_trajectory import rms_px, without_object_pose
+from tomopose.calibration.uncertainty.trajectory import rms_px, without_object_pose
 from tomopose.cli.main import run
 from tomopose.geometry.projection import eq5_matrices, project_ball
 from tomopose.manipulator.files import write_manipulator

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 import tomopose as tp
 from tomopose.cli.main import run
 from tomopose.geometry.projection import eq5_matrices
-from tomopose.simulation.materials import attenuation
+from tomopose.simulation.physics.materials import attenuation
 
 SCENE = """
 schema = "tomopose/scene/1"

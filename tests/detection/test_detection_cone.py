@@ -10,8 +10,8 @@ from scipy.stats import norm
 
 from tomopose import Scanner
 from tomopose.detection import detect_image
-from tomopose.detection.cone import cone_angle, cone_coordinates, cone_radius
-from tomopose.detection.profile import edge_profile
+from tomopose.detection.rim_fit.cone import cone_angle, cone_coordinates, cone_radius
+from tomopose.detection.rim_fit.edge_profile import edge_profile
 from tomopose.geometry.silhouette import silhouette_ellipse
 
 

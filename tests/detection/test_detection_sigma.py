@@ -10,8 +10,8 @@ from ball_images import Scene, noise_free, noisy, standard_scene, window
 from scipy.ndimage import gaussian_filter
 
 from tomopose.detection import detect_image
-from tomopose.detection.noise import correlation, evident, sandwich
-from tomopose.detection.sectors import PARTS, changes, trust
+from tomopose.detection.rim_fit.noise import correlation, evident, sandwich
+from tomopose.detection.rim_fit.sector_test import PARTS, changes, trust
 from tomopose.units import Array
 
 SIZE = 60

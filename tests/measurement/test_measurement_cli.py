@@ -18,7 +18,7 @@ from tomopose.cli import measure as verb
 from tomopose.errors import FileError, InputError, UnitError
 from tomopose.geometry.projection import project_ball
 from tomopose.io.volume_files import write_volume
-from tomopose.measurement.meshes import Mesh
+from tomopose.measurement.mesh.mesh import Mesh
 from tomopose.trajectory.tilt import eq11_triangle
 
 REPEATS = """

@@ -13,11 +13,11 @@ from scipy.special import ndtr
 from tomopose.errors import FileError, InputError, UnitError
 from tomopose.geometry.rotations import exp_rotation
 from tomopose.measurement.alignment import Alignment, from_points
-from tomopose.measurement.comparison import compare
-from tomopose.measurement.mesh_files import FILES, write_comparison
-from tomopose.measurement.mesh_refine import refined
-from tomopose.measurement.meshes import Mesh, read_mesh, signed_distances
-from tomopose.measurement.reference_correction import corrected_reference, read_probed_points
+from tomopose.measurement.mesh.cmm_correction import corrected_reference, read_probed_points
+from tomopose.measurement.mesh.comparison import compare
+from tomopose.measurement.mesh.comparison_files import FILES, write_comparison
+from tomopose.measurement.mesh.mesh import Mesh, read_mesh, signed_distances
+from tomopose.measurement.mesh.refine import refined
 from tomopose.volume import VoxelGrid
 
 V, SIGMA = 0.1, 0.1

@@ -12,10 +12,10 @@ from scipy.spatial import cKDTree
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.rotations import exp_rotation
-from tomopose.measurement import measurands as m
-from tomopose.measurement.correlation import independence
-from tomopose.measurement.features import narrowest_shell, patch_means
-from tomopose.measurement.fits import fit_circle, fit_cone, fit_cylinder, fit_line, fit_plane, fit_sphere
+from tomopose.measurement.features import measurands as m
+from tomopose.measurement.features.correlation import independence
+from tomopose.measurement.features.feature import narrowest_shell, patch_means
+from tomopose.measurement.features.fits import fit_circle, fit_cone, fit_cylinder, fit_line, fit_plane, fit_sphere
 from tomopose.measurement.probing import cylinder_pattern, plane_pattern, sphere_pattern
 
 AXIS = [0.2, -0.3, 1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tomopose.measurement import fits
+from tomopose.measurement.features import fits
 from tomopose.measurement.nist import read_reference_pair, reference_pairs
 
 LENGTH_MM, ANGLE_RAD = 1e-8, 1e-8

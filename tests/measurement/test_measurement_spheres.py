@@ -9,10 +9,10 @@ from scipy.special import ndtr
 
 from tomopose.errors import InputError
 from tomopose.geometry.rotations import exp_rotation
+from tomopose.measurement.features.sphere_standard import find_spheres, identify_spheres, scale_factor
 from tomopose.measurement.measure import measure
 from tomopose.measurement.plan import plan_from
-from tomopose.measurement.spheres import find_spheres, identify_spheres, scale_factor
-from tomopose.measurement.surface import surface
+from tomopose.measurement.surface.surface import surface
 from tomopose.volume import VoxelGrid
 
 V, SIGMA, DIAMETER = 0.15, 0.15, 1.8

@@ -10,12 +10,12 @@ from scipy.special import ndtr
 from scipy.stats import t
 
 from tomopose.errors import InputError, ShapeError
-from tomopose.measurement.edge_search import EdgeFlag, EdgeSettings
-from tomopose.measurement.fits import fit_plane, fit_sphere
-from tomopose.measurement.histogram import given_levels, grey_levels
-from tomopose.measurement.plateaus import shared_plateaus
+from tomopose.measurement.features.fits import fit_plane, fit_sphere
 from tomopose.measurement.probing import plane_pattern, probe, sphere_pattern
-from tomopose.measurement.surface import surface, surfaces
+from tomopose.measurement.surface.edges import EdgeFlag, EdgeSettings
+from tomopose.measurement.surface.grey_levels import given_levels, grey_levels
+from tomopose.measurement.surface.plateaus import shared_plateaus
+from tomopose.measurement.surface.surface import surface, surfaces
 from tomopose.volume import Volume, VoxelGrid
 
 V = 0.1482

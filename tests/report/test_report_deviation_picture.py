@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tomopose.errors import ShapeError
-from tomopose.report.deviation_picture import (
+from tomopose.report.figures.deviation_picture import (
     NOT_MEASURED,
     deviation_figure,
     drawn,
@@ -16,9 +16,9 @@ from tomopose.report.deviation_picture import (
     viewpoint,
     vik,
 )
+from tomopose.report.figures.png import colour_png
 from tomopose.report.page import Figure
-from tomopose.report.png import colour_png
-from tomopose.report.study_page import figure_png
+from tomopose.report.pages.study_page import figure_png
 from tomopose.report.style import axis, layout
 
 matplotlib = pytest.importorskip("matplotlib")

@@ -12,12 +12,12 @@ import pytest
 
 from tomopose import BallObservations, PoseSequence
 from tomopose.errors import ShapeError
-from tomopose.report.coverage_figures import correlation
+from tomopose.report.figures.coverage_figures import correlation
+from tomopose.report.figures.png import grey_levels, grey_png
+from tomopose.report.figures.residual_figures import by_pose, quantiles, quiver, rotation_table
+from tomopose.report.figures.scene_figures import ball_in_world, panel_corners
+from tomopose.report.figures.thumbnails import Thumbnail, ellipse_outline, thumbnail, thumbnail_svg, worst_thumbnails
 from tomopose.report.gather import join, minutes, rotation_groups
-from tomopose.report.png import grey_levels, grey_png
-from tomopose.report.residual_figures import by_pose, quantiles, quiver, rotation_table
-from tomopose.report.scene_figures import ball_in_world, panel_corners
-from tomopose.report.thumbnails import Thumbnail, ellipse_outline, thumbnail, thumbnail_svg, worst_thumbnails
 from tomopose.report.words import cell, decimals, heading, meaning, number, small_unit, symbol
 
 

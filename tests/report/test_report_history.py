@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from tomopose import RigidTransform
-from tomopose.calibration.compare import compare
-from tomopose.calibration.history import history_entry
+from tomopose.calibration.records.compare import compare
+from tomopose.calibration.records.history import history_entry
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.report import calibration_report, comparison_report, history_report
-from tomopose.report.history_page import signed
+from tomopose.report.pages.history_page import signed
 
 
 def shifted(calibration, t):

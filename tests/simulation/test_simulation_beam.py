@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tomopose.errors import InputError
-from tomopose.simulation.attenuate import attenuated
-from tomopose.simulation.materials import MATERIALS, Material, attenuation, from_formula
-from tomopose.simulation.spectrum import CONDENSED_ERROR, Spectrum, condense, tube_spectrum
+from tomopose.simulation.physics.attenuation import attenuated
+from tomopose.simulation.physics.materials import MATERIALS, Material, attenuation, from_formula
+from tomopose.simulation.physics.spectrum import CONDENSED_ERROR, Spectrum, condense, tube_spectrum
 
 # Mass attenuation coefficients, cm2/g: Hubbell and Seltzer, NISTIR 5632 (NIST Standard Reference Database 126,
 # physics.nist.gov/xaamdi); C, Al and Cu compared with its pages as github.com/ehsteve/roentgen keeps them.

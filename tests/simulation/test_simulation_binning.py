@@ -10,10 +10,10 @@ import pytest
 
 from tomopose import Scanner
 from tomopose.errors import InputError
-from tomopose.simulation.build import simulate
-from tomopose.simulation.detector import Detector, blocks, expose, fixed_pattern
+from tomopose.simulation.detector.detector import Detector, blocks, expose, fixed_pattern
 from tomopose.simulation.run import transmission
-from tomopose.simulation.scene import scene_from
+from tomopose.simulation.scene.build import simulate
+from tomopose.simulation.scene.scene import scene_from
 
 FINE = Scanner(d_SD=800.0, d_SR=200.0, p_u=0.4, p_v=0.5, u_0=60.3, v_0=57.1, n_u=122, n_v=118)
 SCENE = {

@@ -11,11 +11,11 @@ import pytest
 from tomopose import PoseSequence, RigidTransform, Scanner
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
-from tomopose.simulation.ctsimu import run_from_ctsimu, run_to_ctsimu
-from tomopose.simulation.mesh import write_stl
+from tomopose.simulation.objects.mesh import write_stl
+from tomopose.simulation.objects.shapes import Solid, box, cylinder
+from tomopose.simulation.projector.focal_spot import FocalSpot
 from tomopose.simulation.run import simulate_ball_run, transmission
-from tomopose.simulation.shapes import Solid, box, cylinder
-from tomopose.simulation.spot import FocalSpot
+from tomopose.simulation.scene.ctsimu import run_from_ctsimu, run_to_ctsimu
 
 pytest.importorskip("embreex")
 pytest.importorskip("manifold3d")

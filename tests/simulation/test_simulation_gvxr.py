@@ -12,8 +12,8 @@ import pytest
 from tomopose import PoseSequence, RigidTransform, Scanner
 from tomopose.errors import EngineFailedError, EngineMissingError
 from tomopose.geometry.frames import Frame
+from tomopose.simulation.objects.shapes import Solid, box, sphere
 from tomopose.simulation.run import simulate_ball_run, transmission
-from tomopose.simulation.shapes import Solid, box, sphere
 
 SMALL = Scanner(d_SD=800.0, d_SR=200.0, p_u=0.4, p_v=0.5, u_0=41.3, v_0=38.7, n_u=81, n_v=77)
 T_BALL = np.array([0.25, 0.55, -0.65])
@@ -53,7 +53,7 @@ def test_both_engines_make_the_same_image(run):
 def test_a_missing_engine_says_how_to_get_it(run, monkeypatch):
     pytest.importorskip("manifold3d")
     monkeypatch.setitem(sys.modules, "gvxrPython3", None)
-    monkeypatch.setattr("tomopose.simulation.gvxr._started", [])
+    monkeypatch.setattr("tomopose.simulation.projector.gvxr._started", [])
     with pytest.raises(EngineMissingError, match="gvxr") as caught:
         transmission(replace(run, engine="gvxr"), 0)
     assert "pip install" in caught.value.install_line

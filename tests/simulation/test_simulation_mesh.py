@@ -10,14 +10,14 @@ import pytest
 from tomopose import PoseSequence, RigidTransform, Scanner
 from tomopose.errors import EngineFailedError, FileError, InputError
 from tomopose.geometry.frames import Frame
-from tomopose.simulation.mesh import Mesh, MeshSolid, mesh_paths, read_mesh, write_stl
-from tomopose.simulation.raster import mesh_path_image
-from tomopose.simulation.rays import path_lengths
+from tomopose.simulation.objects.mesh import Mesh, MeshSolid, mesh_paths, read_mesh, write_stl
+from tomopose.simulation.objects.shapes import Solid, box, cone, cylinder, half_space, sphere, torus
+from tomopose.simulation.objects.specimen import LENGTH, measurands, specimen_mesh
+from tomopose.simulation.objects.tessellate import tessellate
+from tomopose.simulation.projector.raster import mesh_path_image
+from tomopose.simulation.projector.rays import path_lengths
+from tomopose.simulation.projector.view import View, Window
 from tomopose.simulation.run import simulate_ball_run, transmission
-from tomopose.simulation.shapes import Solid, box, cone, cylinder, half_space, sphere, torus
-from tomopose.simulation.specimen import LENGTH, measurands, specimen_mesh
-from tomopose.simulation.tessellate import tessellate
-from tomopose.simulation.view import View, Window
 
 pytest.importorskip("embreex")
 pytest.importorskip("manifold3d")

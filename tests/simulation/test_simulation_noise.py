@@ -9,8 +9,8 @@ import pytest
 
 from tomopose import Scanner
 from tomopose.errors import InputError
-from tomopose.simulation.detector import Detector, beam_profile, expose, fixed_pattern, reference_images
-from tomopose.simulation.noise import add_normal_noise, add_photon_noise, frame_key
+from tomopose.simulation.detector.detector import Detector, beam_profile, expose, fixed_pattern, reference_images
+from tomopose.simulation.detector.noise import add_normal_noise, add_photon_noise, frame_key
 
 N = 1000
 PANEL = Scanner(d_SD=1000.0, d_SR=500.0, p_u=0.2, p_v=0.25, u_0=140.0, v_0=130.0, n_u=301, n_v=257)

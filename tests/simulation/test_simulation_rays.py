@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
-from tomopose.simulation.rays import compile_solids, path_lengths
-from tomopose.simulation.shapes import Solid, box, cone, cylinder, half_space, sphere, torus, union
+from tomopose.simulation.objects.shapes import Solid, box, cone, cylinder, half_space, sphere, torus, union
+from tomopose.simulation.projector.rays import compile_solids, path_lengths
 
 NANOMETRE = 1e-6
 STEP = 2e-3

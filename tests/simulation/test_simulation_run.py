@@ -15,13 +15,21 @@ from tomopose import PoseSequence, RigidTransform, Scanner
 from tomopose.errors import InputError, OutOfViewError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import project_ball
-from tomopose.simulation.ball import silhouette_centre
-from tomopose.simulation.blur import pixel_kernel
-from tomopose.simulation.detector import Detector
-from tomopose.simulation.effects import MTF, Glare, Scatter, wide_blur, with_glare, with_mtf, with_scatter
+from tomopose.simulation.detector.blur import pixel_kernel
+from tomopose.simulation.detector.detector import Detector
+from tomopose.simulation.detector.scatter_glare_mtf import (
+    MTF,
+    Glare,
+    Scatter,
+    wide_blur,
+    with_glare,
+    with_mtf,
+    with_scatter,
+)
+from tomopose.simulation.objects.ball import silhouette_centre
+from tomopose.simulation.objects.shapes import Solid, sphere
+from tomopose.simulation.projector.focal_spot import FocalSpot, Motion
 from tomopose.simulation.run import render, signal, simulate_ball_run, transmission
-from tomopose.simulation.shapes import Solid, sphere
-from tomopose.simulation.spot import FocalSpot, Motion
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = Scanner(d_SD=800.0, d_SR=200.0, p_u=0.4, p_v=0.5, u_0=71.3, v_0=58.7, n_u=141, n_v=123, eta=0.01, theta=0.02)

@@ -11,9 +11,9 @@ import pytest
 
 from tomopose.errors import FileError, InputError
 from tomopose.geometry.rotations import rotation_angle_between
-from tomopose.simulation.build import simulate
-from tomopose.simulation.scene import read_scene, scene_from, scene_schema
-from tomopose.simulation.standard import sphere_centres, standard_layout
+from tomopose.simulation.objects.sphere_standard import sphere_centres, standard_layout
+from tomopose.simulation.scene.build import simulate
+from tomopose.simulation.scene.scene import read_scene, scene_from, scene_schema
 
 SCENES = Path(__file__).resolve().parents[2] / "examples/scenes"
 

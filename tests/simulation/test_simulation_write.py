@@ -12,7 +12,7 @@ from tomopose import open_images, read_poses, read_scanner, simulate
 from tomopose.cli.simulated import frames, write_run
 from tomopose.errors import FileError, InputError
 from tomopose.io.images.stack import frames_kept, partial
-from tomopose.simulation.scene import scene_from
+from tomopose.simulation.scene.scene import scene_from
 
 SCENE = {
     "schema": "tomopose/scene/1",

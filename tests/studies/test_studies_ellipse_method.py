@@ -7,8 +7,14 @@ import pytest
 
 from tomopose import Scanner
 from tomopose.errors import BallNotFoundError
-from tomopose.simulation.ball import silhouette_centre
-from tomopose.studies.ellipse_method import centre_and_axes, corrected_centre, edge_pixels, ellipse_method, fit_ellipse
+from tomopose.simulation.objects.ball import silhouette_centre
+from tomopose.studies.parts.ellipse_method import (
+    centre_and_axes,
+    corrected_centre,
+    edge_pixels,
+    ellipse_method,
+    fit_ellipse,
+)
 
 SCANNER = Scanner(d_SD=1200.0, d_SR=310.0, p_u=0.2, p_v=0.25, u_0=733.4, v_0=512.7, n_u=1501, n_v=1203)
 

@@ -9,21 +9,21 @@ import pytest
 from scipy.linalg import block_diag
 
 import tomopose as tp
-from tomopose.calibration.propagate import length_sigma
+from tomopose.calibration.uncertainty.propagation import length_sigma
 from tomopose.errors import InputError
 from tomopose.geometry.projection import project_ball
 from tomopose.manipulator.error_models import manipulator_block
 from tomopose.manipulator.pose_map import PoseMap
 from tomopose.measurement.alignment import Alignment
-from tomopose.measurement.fits import fit_plane, fit_sphere
+from tomopose.measurement.features.fits import fit_plane, fit_sphere
 from tomopose.measurement.measure import measure
 from tomopose.measurement.plan import plan_from
 from tomopose.measurement.probing import plane_pattern, sphere_pattern
 from tomopose.measurement.results import MeasurementResults
 from tomopose.measurement.uncertainty import displaced
-from tomopose.simulation.scene import scene_from
-from tomopose.studies.length_uncertainty import calibration_shares
-from tomopose.studies.simulated_uncertainty import drawn_matrices, simulated_errors, virtual_volumes
+from tomopose.simulation.scene.scene import scene_from
+from tomopose.uncertainty.calibration_share import calibration_shares
+from tomopose.uncertainty.virtual_scans import drawn_matrices, simulated_errors, virtual_volumes
 
 BALLS, RADIUS = np.array([[-1.4, 0.2, 0.6], [1.3, -0.3, -0.5]]), 0.8
 SCANNER = {"d_SD_mm": 900.0, "d_SR_mm": 200.0, "p_u_mm": 0.6, "p_v_mm": 0.63, "u_0_px": 29.3, "v_0_px": 31.1,

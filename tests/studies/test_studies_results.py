@@ -13,12 +13,20 @@ from tomopose.cli.study import register
 from tomopose.errors import EngineMissingError, FileError, InputError
 from tomopose.geometry.projection import project_ball
 from tomopose.observations import BallObservations
-from tomopose.studies import figure8, hexapod_runs, improvements, table1, table2, virtual_hexapod
-from tomopose.studies.radiographs import Measured, errors_of, exact_rms, measure_run, read_out_windows, solve_as_paper
+from tomopose.studies import figure8, improvements, table1, table2
+from tomopose.studies.parts import hexapod_runs, virtual_hexapod
+from tomopose.studies.parts.radiographs import (
+    Measured,
+    errors_of,
+    exact_rms,
+    measure_run,
+    read_out_windows,
+    solve_as_paper,
+)
+from tomopose.studies.parts.result import StudyCheck
+from tomopose.studies.parts.steps import Steps
+from tomopose.studies.parts.writing import write_study
 from tomopose.studies.registry import PAPER, run_study
-from tomopose.studies.result import StudyCheck
-from tomopose.studies.steps import Steps
-from tomopose.studies.writing import write_study
 
 
 def silent(done: int, total: int) -> None:

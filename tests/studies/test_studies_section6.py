@@ -11,20 +11,25 @@ from tomopose import Scanner
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import eq5_matrices
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.simulation.mesh import MeshSolid
-from tomopose.simulation.mesh import mesh_paths as embree_paths
-from tomopose.simulation.rays import compile_solids, path_lengths
-from tomopose.simulation.specimen import specimen_mesh
-from tomopose.simulation.standard import BASE_TOP, multi_sphere_standard, sphere_centres, sphere_diameters
-from tomopose.studies import section6
+from tomopose.simulation.objects.mesh import MeshSolid
+from tomopose.simulation.objects.mesh import mesh_paths as embree_paths
+from tomopose.simulation.objects.specimen import specimen_mesh
+from tomopose.simulation.objects.sphere_standard import (
+    BASE_TOP,
+    multi_sphere_standard,
+    sphere_centres,
+    sphere_diameters,
+)
+from tomopose.simulation.projector.rays import compile_solids, path_lengths
 from tomopose.studies.demo import demo_setup
-from tomopose.studies.section6_calibrations import calibrations, planned_run
-from tomopose.studies.section6_paths import ball_paths, fine_matrices, mesh_paths
-from tomopose.studies.section6_scan import MOUNTED, WHITE, Numbers, Radiographs, grid_of, scan_with, specimen
-from tomopose.studies.section6_specimen import cylinder_areas, reference, true_lengths, unseen_by_circle
-from tomopose.studies.section6_tables import MPE_A_UM, limit, verdict, waves
-from tomopose.studies.section6_volumes import NEAR_MM, cases_of, near
-from tomopose.studies.steps import Steps
+from tomopose.studies.parts.steps import Steps
+from tomopose.studies.section6 import study as section6
+from tomopose.studies.section6.calibrations import calibrations, planned_run
+from tomopose.studies.section6.paths import ball_paths, fine_matrices, mesh_paths
+from tomopose.studies.section6.scan import MOUNTED, WHITE, Numbers, Radiographs, grid_of, scan_with, specimen
+from tomopose.studies.section6.specimen import cylinder_areas, reference, true_lengths, unseen_by_circle
+from tomopose.studies.section6.tables import MPE_A_UM, limit, verdict, waves
+from tomopose.studies.section6.volumes import NEAR_MM, cases_of, near
 from tomopose.trajectory.completeness import source_path
 from tomopose.trajectory.scan import tilted_scan
 from tomopose.trajectory.tilt import eq11_triangle
@@ -98,7 +103,7 @@ def test_radiographs_are_the_same_each_time_and_as_noisy_as_said():
 def test_kept_frames_are_those_that_are_made(tmp_path, monkeypatch):
     scan = scan_with("standard", "3D", TINY, 5)
     made = Radiographs(scan)[2]
-    monkeypatch.setattr("tomopose.studies.section6_scan.MOST_KEPT_BYTES", 1e3)
+    monkeypatch.setattr("tomopose.studies.section6.scan.MOST_KEPT_BYTES", 1e3)
     kept = Radiographs(scan, tmp_path)
     np.testing.assert_array_equal(kept[2], made)
     again = Radiographs(scan, tmp_path)
@@ -190,13 +195,13 @@ def test_a_tiny_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
         return solved[m, number]
 
     monkeypatch.setattr(section6, "calibrations", once)
-    monkeypatch.setattr("tomopose.studies.section6_standard.POINTS", 80)
+    monkeypatch.setattr("tomopose.studies.section6.standard.POINTS", 80)
     rows, checks, figures, _ = section6.run_with(TINY, 7, steps, lambda done, total: None)
     wave = next(r for r in rows if r.group.startswith("Fig. 12, 3D") and "seven periods" in r.quantity)
     assert wave.best < 0.5 * wave.paper_method
     assert len(figures) == 9
     assert len({c.statement for c in checks}) == len(checks)
-    monkeypatch.setattr("tomopose.studies.section6_volumes.reconstruct", lambda *a, **k: pytest.fail("made again"))
+    monkeypatch.setattr("tomopose.studies.section6.volumes.reconstruct", lambda *a, **k: pytest.fail("made again"))
     again = section6.run_with(TINY, 7, steps, lambda done, total: None)
     assert again[0] == rows
     assert again[1] == checks

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tomopose.studies.steps import Steps, sources
+from tomopose.studies.parts.steps import Steps, sources
 
 
 def test_a_kept_step_is_not_computed_again_and_gives_the_same_numbers(tmp_path):
@@ -39,16 +39,18 @@ def test_a_step_of_other_code_is_computed_anew(tmp_path, monkeypatch):
 
     compute.__module__ = "tomopose.studies.tuy"
     assert Steps(folder=tmp_path).of("one", compute) == {"x": 1}
-    monkeypatch.setattr("tomopose.studies.steps.sources", lambda module: "other")
+    monkeypatch.setattr("tomopose.studies.parts.steps.sources", lambda module: "other")
     assert Steps(folder=tmp_path).of("one", lambda: {"x": 2}) == {"x": 2}
 
 
 def test_sources_are_those_that_a_module_imports(monkeypatch, tmp_path):
-    (tmp_path / "a.py").write_text("from tomopose.studies.b import f\n")
-    (tmp_path / "b.py").write_text("from tomopose.studies import c\n")
-    (tmp_path / "c.py").write_text("x = 1\n")
-    (tmp_path / "d.py").write_text("y = 1\n")
-    monkeypatch.setattr("tomopose.studies.steps.__file__", str(tmp_path / "steps.py"))
+    house = tmp_path / "tomopose"
+    (house / "studies").mkdir(parents=True)
+    (house / "studies" / "a.py").write_text("from tomopose.studies.b import f\n")
+    (house / "studies" / "b.py").write_text("from tomopose import (\n    c,\n)\n")
+    (house / "c.py").write_text("x = 1\n")
+    (house / "d.py").write_text("y = 1\n")
+    monkeypatch.setattr("tomopose.studies.parts.steps.PACKAGE", house)
 
     def digest():
         sources.cache_clear()
@@ -56,9 +58,9 @@ def test_sources_are_those_that_a_module_imports(monkeypatch, tmp_path):
 
     try:
         first = digest()
-        (tmp_path / "d.py").write_text("y = 2\n")
+        (house / "d.py").write_text("y = 2\n")
         assert digest() == first != ""
-        (tmp_path / "c.py").write_text("x = 2\n")
+        (house / "c.py").write_text("x = 2\n")
         assert digest() != first
         assert sources("numpy.linalg") == ""
     finally:

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.estimate import Solution, solve, with_pose_noise
-from tomopose.calibration.fit import blocks, tangent_names
-from tomopose.calibration.hypotheses import Diagnosis, ranked, set_pose_rival
-from tomopose.calibration.integrity import Integrity, integrity
-from tomopose.calibration.observability import observability
-from tomopose.calibration.parameters import (
+from tomopose.calibration.checks.convention_tests import Diagnosis, ranked, set_pose_rival
+from tomopose.calibration.checks.conventions import RIVALS, Rival
+from tomopose.calibration.checks.stability import Integrity, integrity
+from tomopose.calibration.checks.verdict import Findings, verdict
+from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS
+from tomopose.calibration.model.covariance import angles_by_tangent, widening
+from tomopose.calibration.model.parameters import (
     UNITS,
     FreeParameters,
     adjusted_scanners,
@@ -22,13 +23,12 @@ from tomopose.calibration.parameters import (
     translation_scale,
     unit_of,
 )
-from tomopose.calibration.problem import pair
-from tomopose.calibration.propagate import tilt_sigma
-from tomopose.calibration.residuals import SCANNER_COLUMNS
+from tomopose.calibration.model.problem import pair
 from tomopose.calibration.result import Calibration, Parameter
-from tomopose.calibration.rivals import RIVALS, Rival
-from tomopose.calibration.uncertainty import angles_by_tangent, widening
-from tomopose.calibration.verdict import Findings, verdict
+from tomopose.calibration.rigid.estimate import Solution, solve, with_pose_noise
+from tomopose.calibration.rigid.fit import blocks, tangent_names
+from tomopose.calibration.rigid.observability import observability
+from tomopose.calibration.uncertainty.propagation import tilt_sigma
 from tomopose.errors import InputError, NotConvergedError
 from tomopose.geometry.rotations import angles_from_rotation
 from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
@@ -235,7 +235,7 @@ def calibrate(
         raise NotConvergedError(rigid.status, calibration=rigid)
     if model == "rigid" or (model == "auto" and manipulator is None):
         return rigid
-    from tomopose.calibration.kinematic import calibrate_kinematic
+    from tomopose.calibration.identified.calibrate import calibrate_kinematic
 
     return calibrate_kinematic(
         scanner, poses, observations, manipulator=manipulator, model=model, rigid=rigid, free=freed,

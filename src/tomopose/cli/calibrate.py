@@ -132,7 +132,7 @@ def calibrate(
     from dataclasses import replace
 
     import tomopose as tp
-    from tomopose.calibration.ball_size import require_ball_size, size_ratio
+    from tomopose.calibration.checks.ball_size import require_ball_size, size_ratio
     from tomopose.cli.job import (
         calibration_summary,
         exit_code,

@@ -35,7 +35,7 @@ def demo(
     The folder is laid out as one would lay out one's own data, and the result is held against the simulation's truth.
     """
     import tomopose as tp
-    from tomopose.calibration.exact import d_rms_exact
+    from tomopose.calibration.records.truth import d_rms_exact
     from tomopose.cli.job import calibration_summary, exit_code, observe, open_for, write_calibration_folder
     from tomopose.cli.simulated import RADIOGRAPHS, write_run
     from tomopose.files import require_absent

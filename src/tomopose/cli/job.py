@@ -17,7 +17,7 @@ RAW = re.compile(r"(?P<n_v>\d+)x(?P<n_u>\d+):(?P<dtype>[^:]+)(:(?P<header>\d+))?
 
 if TYPE_CHECKING:
     from tomopose import BallObservations, Calibration, PoseSequence, ProjectionMatrices, Scanner
-    from tomopose.report.thumbnails import Thumbnail
+    from tomopose.report.figures.thumbnails import Thumbnail
 
 
 def image_source(text: str) -> str | Path:
@@ -156,7 +156,7 @@ def write_calibration_folder(
 
 def calibration_summary(calibration: Calibration) -> tuple[dict[str, Any], list[str]]:
     """The figures of a calibration, for programs and for people."""
-    from tomopose.calibration.parameters import UNITS as units
+    from tomopose.calibration.model.parameters import UNITS as units
     from tomopose.units import value_with_uncertainty
 
     # The mount, the balls and the scanner are a dozen numbers; a manipulator's errors would drown them.

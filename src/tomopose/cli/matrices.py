@@ -101,7 +101,7 @@ def matrices(
     scan = tp.read_poses(poses, forward=forward_of(machine))
     given: dict[str, Any] = {"binning": binning, "scanner": None if scanner is None else tp.read_scanner(scanner)}
     if source_poses is not None:
-        from tomopose.calibration.twin_robots import twin_notes
+        from tomopose.calibration.arrangements.twin_robots import twin_notes
 
         source = tp.read_poses(source_poses, forward=forward_of(other))
         result, notes = tp.twin_matrices(cal, scan, source, **given), twin_notes(cal, scan, source)

@@ -89,8 +89,8 @@ def measure(
     from tomopose.measurement.plan import read_plan
     from tomopose.measurement.results import write_results
     from tomopose.provenance import provenance
-    from tomopose.report.measurement_page import measurement_report
     from tomopose.report.page import write_report
+    from tomopose.report.pages.measurement_page import measurement_report
 
     say = Say(json=as_json, quiet=quiet)
     if fit not in FITS:
@@ -140,9 +140,9 @@ def measure(
 
 def reference_of(path: Path, edge_mm: float | None, probed: Path | None, between: str) -> Any:
     """The reference mesh, of smaller triangles and corrected by probed points where that is asked for."""
-    from tomopose.measurement.mesh_refine import refined
-    from tomopose.measurement.meshes import read_mesh
-    from tomopose.measurement.reference_correction import corrected_reference, read_probed_points
+    from tomopose.measurement.mesh.cmm_correction import corrected_reference, read_probed_points
+    from tomopose.measurement.mesh.mesh import read_mesh
+    from tomopose.measurement.mesh.refine import refined
 
     mesh = read_mesh(path)
     if edge_mm is not None:
@@ -155,7 +155,7 @@ def reference_of(path: Path, edge_mm: float | None, probed: Path | None, between
 def compared(volume: Any, mesh: Any, alignment: Any, *, fit: str, search_mm: float | None) -> Any:
     """The comparison, from the alignment that the plan gave."""
     from tomopose.errors import InputError
-    from tomopose.measurement.comparison import compare
+    from tomopose.measurement.mesh.comparison import compare
 
     if fit == "datum" and not alignment.rule.startswith("datum"):
         raise InputError('--fit datum needs a plan with [alignment] kind = "datum" and three datums')
@@ -166,8 +166,8 @@ def compared(volume: Any, mesh: Any, alignment: Any, *, fit: str, search_mm: flo
 def write_comparison_to(folder: Path, comparison: Any, range_mm: float, name: str, *, force: bool) -> None:
     """Mesh files, tables and the picture of one comparison."""
     from tomopose.files import atomic_file, require_absent
-    from tomopose.measurement.mesh_files import write_comparison
-    from tomopose.report.measurement_png import comparison_png
+    from tomopose.measurement.mesh.comparison_files import write_comparison
+    from tomopose.report.figures.measurement_png import comparison_png
 
     picture = require_absent(folder / "comparison.png", force=force)
     write_comparison(comparison, folder, range_mm=range_mm, force=force)
@@ -181,7 +181,7 @@ def calibration_u(
     """Volume -> measurand -> standard uncertainty from its calibration; the file without a name serves all others."""
     import tomopose as tp
     from tomopose.errors import InputError
-    from tomopose.studies.length_uncertainty import calibration_shares
+    from tomopose.uncertainty.calibration_share import calibration_shares
 
     unknown = sorted(({*calibrations, *scans} - {""}) - set(results.volumes))
     if unknown:
@@ -201,7 +201,7 @@ def simulated(
     """Errors over virtual scans on the volume's own grid, or a coarser one over the same box."""
     import tomopose as tp
     from tomopose.cli.simulated import run_of
-    from tomopose.studies.simulated_uncertainty import simulated_errors
+    from tomopose.uncertainty.virtual_scans import simulated_errors
 
     run = run_of(tp.read_scene(scene), scene)
     file = next(iter(calibrations.values()), None)

@@ -29,7 +29,7 @@ def monitor(
 ) -> int:
     """Keep a history of calibrations and draw control charts of the mount and the residual."""
     import tomopose as tp
-    from tomopose.calibration.history import append_history, read_history
+    from tomopose.calibration.records.history import append_history, read_history
     from tomopose.report import history_report, write_report
 
     say = Say(json=as_json, quiet=quiet)

@@ -66,15 +66,15 @@ def kinematic_poses(
     """The plan that determines what a tilted scan needs of the manipulator's own errors; angles in degrees."""
     import numpy as np
 
-    from tomopose.calibration.kinematic_design import plan_kinematic
-    from tomopose.calibration.kinematic_trajectory import object_points
+    from tomopose.calibration.uncertainty.trajectory import object_points
     from tomopose.planning.design import BALL_MM, nominal_mount
+    from tomopose.planning.identified_design import plan_kinematic
     from tomopose.planning.limits import candidates
     from tomopose.planning.target import default_scan
 
     ball = np.array(BALL_MM)
     if hasattr(machine, "joints"):
-        from tomopose.calibration.kinematic_robot import robot_work
+        from tomopose.planning.robot_candidates import robot_work
 
         work = robot_work(
             machine, half_range=half_range, tilt=math.radians(tilt), spin=math.radians(spin),

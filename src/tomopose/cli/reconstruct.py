@@ -63,8 +63,8 @@ def polynomial(scene: Path | None, material: str | None, thickness: float | None
         )
     import tomopose as tp
     from tomopose.reconstruction import beam_hardening_polynomial
-    from tomopose.simulation.build import beam
-    from tomopose.simulation.materials import attenuation
+    from tomopose.simulation.physics.materials import attenuation
+    from tomopose.simulation.scene.build import beam
 
     spectrum, materials = beam(tp.read_scene(scene))
     mu = attenuation(material, spectrum.energy, materials=materials)

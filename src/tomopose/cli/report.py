@@ -31,7 +31,7 @@ def report(
 ) -> int:
     """Write one HTML file that needs no network: verdict, parameters, residuals, pictures, the scene in 3D."""
     import tomopose as tp
-    from tomopose.calibration.history import read_history
+    from tomopose.calibration.records.history import read_history
     from tomopose.cli.job import image_source, open_for, worst
     from tomopose.errors import FileError
     from tomopose.files import require_absent

@@ -11,7 +11,7 @@ import typer
 from tomopose.cli.common import OK, DaskOption, ForceOption, JsonOption, QuietOption, Say, WorkersOption, names
 
 if TYPE_CHECKING:
-    from tomopose.simulation.scene import Scene
+    from tomopose.simulation.scene.scene import Scene
 
 EPILOG = (
     "Example: tomopose simulate scene.toml --out run/ --workers 2; the paper's table 1: tomopose simulate "

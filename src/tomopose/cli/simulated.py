@@ -28,7 +28,7 @@ def image_names(pose_ids: Iterable[str]) -> list[str]:
 
 def frames(run: Any, wanted: Sequence[int], *, workers: int = 1, client: Any = None) -> Iterator[tuple[int, Any]]:
     """(number, image) of the wanted frames, in order, made by threads here or by a dask client's workers."""
-    from tomopose.detection.executors import ordered_map
+    from tomopose.detection.run.executors import ordered_map
 
     if client is not None:
         # The run travels once to each worker, not with every frame.

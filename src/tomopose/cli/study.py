@@ -45,8 +45,8 @@ def study(
     code 3 where a statement that the study tests does not hold.
     """
     from tomopose.files import require_absent
+    from tomopose.studies.parts.writing import write_study
     from tomopose.studies.registry import run_study
-    from tomopose.studies.writing import write_study
 
     say = Say(json=as_json, quiet=quiet)
     folder = Path(f"study-{name}") if out is None else out

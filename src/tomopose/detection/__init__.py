@@ -1,7 +1,7 @@
 """Detection: the projection of the ball's centre in each radiograph, at the accuracy that the noise allows."""
 
-from tomopose.detection.detect import detect
 from tomopose.detection.image import detect_image
 from tomopose.detection.result import BallImage
+from tomopose.detection.run.detect import detect
 
 __all__ = ["BallImage", "detect", "detect_image"]

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from tomopose.detection.cone import ring_pixels
-from tomopose.detection.cone_fit import ConeFit
+from tomopose.detection.rim_fit.cone import ring_pixels
+from tomopose.detection.rim_fit.fit import ConeFit
 from tomopose.errors import DetectionError
 from tomopose.geometry.scanner import Scanner
 from tomopose.units import Array

@@ -9,10 +9,10 @@ from typing import Any, Protocol
 import numpy as np
 from numba import njit
 
-from tomopose.detection.cone_fit import ConeFit, fit_cone
-from tomopose.detection.find import Candidate, find_ball
+from tomopose.detection.finder.find import Candidate, find_ball
 from tomopose.detection.flags import expected_radius, flags_of, saturated_share
 from tomopose.detection.result import BallImage
+from tomopose.detection.rim_fit.fit import ConeFit, fit_cone
 from tomopose.errors import BallNotFoundError, BallTruncatedError, DetectionError, InputError, ShapeError
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.silhouette import silhouette_ellipse

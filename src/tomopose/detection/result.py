@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tomopose.detection.find import Candidate
+from tomopose.detection.finder.find import Candidate
 from tomopose.units import Array
 
 

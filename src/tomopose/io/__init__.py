@@ -1,7 +1,7 @@
 """Files in and out.  Units and row orders are converted here; inside there is one unit and one order."""
 
 from tomopose.io.calibration_json import read_calibration, write_calibration
-from tomopose.io.gcs_log import read_gcs_log
+from tomopose.io.foreign.pi_gcs import read_gcs_log
 from tomopose.io.images import ImageSequence, RawLayout, open_images, write_hdf5, write_tiff
 from tomopose.io.matrices_npz import read_matrices, write_matrices
 from tomopose.io.notices import InputWarning

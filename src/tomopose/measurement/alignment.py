@@ -9,7 +9,7 @@ import numpy as np
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.rotations import exp_rotation, log_rotation
-from tomopose.measurement.shapes import frame_along
+from tomopose.measurement.features.shapes import frame_along
 from tomopose.units import Array, float_array
 
 

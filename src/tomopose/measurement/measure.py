@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 
 from tomopose.errors import InputError
-from tomopose.measurement import measurands as m
 from tomopose.measurement.alignment import Alignment, Datum, best_fit, datum, from_datums
-from tomopose.measurement.edge_search import EdgeSettings, counts_in_words
-from tomopose.measurement.features import Feature
-from tomopose.measurement.fits import fit_circle, fit_cone, fit_cylinder, fit_line, fit_plane, fit_sphere
-from tomopose.measurement.histogram import GreyLevels, given_levels, grey_levels
+from tomopose.measurement.features import measurands as m
+from tomopose.measurement.features.feature import Feature
+from tomopose.measurement.features.fits import fit_circle, fit_cone, fit_cylinder, fit_line, fit_plane, fit_sphere
+from tomopose.measurement.features.sphere_standard import CORRELATION_VOXELS, measure_spheres, scale_factor
 from tomopose.measurement.plan import FeaturePlan, LimitPlan, MeasurandPlan, MeasurementPlan, SpheresPlan
 from tomopose.measurement.probing import probe
 from tomopose.measurement.regions import nominal_pattern, surface_region
 from tomopose.measurement.results import MeasurementResult, MeasurementResults
-from tomopose.measurement.spheres import CORRELATION_VOXELS, measure_spheres, scale_factor
-from tomopose.measurement.surface import Surface, surface
+from tomopose.measurement.surface.edges import EdgeSettings, counts_in_words
+from tomopose.measurement.surface.grey_levels import GreyLevels, given_levels, grey_levels
+from tomopose.measurement.surface.surface import Surface, surface
 from tomopose.provenance import Provenance
 from tomopose.units import Array
 from tomopose.volume import Volume

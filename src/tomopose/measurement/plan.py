@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from tomopose.errors import FileError, InputError, SchemaVersionError, UnitError
-from tomopose.measurement.measurands import Kind, Rule
+from tomopose.measurement.features.measurands import Kind, Rule
 
 SCHEMA = "tomopose/measurement-plan/1"
 Vector = tuple[float, float, float]

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from tomopose.errors import InputError
-from tomopose.measurement.edge_search import Edges, EdgeSettings, search_edges
-from tomopose.measurement.shapes import frame_along
+from tomopose.measurement.features.shapes import frame_along
+from tomopose.measurement.surface.edges import Edges, EdgeSettings, search_edges
 from tomopose.units import Array, float_array
 from tomopose.volume import Volume
 

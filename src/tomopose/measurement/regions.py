@@ -11,9 +11,9 @@ import numpy as np
 
 from tomopose.errors import InputError
 from tomopose.measurement.alignment import Alignment
+from tomopose.measurement.features.shapes import frame_along
 from tomopose.measurement.plan import FeaturePlan
 from tomopose.measurement.probing import circle_pattern, cylinder_pattern, line_pattern, plane_pattern, sphere_pattern
-from tomopose.measurement.shapes import frame_along
 from tomopose.units import Array
 
 

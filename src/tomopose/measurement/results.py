@@ -15,7 +15,7 @@ import numpy as np
 from tomopose.files import atomic_folder, write_json, write_text
 from tomopose.measurement.alignment import Alignment
 from tomopose.measurement.budget import FIT_ALONE, Budget, budget, half_width
-from tomopose.measurement.features import Feature
+from tomopose.measurement.features.feature import Feature
 from tomopose.measurement.uncertainty import Simulated
 from tomopose.provenance import Provenance
 

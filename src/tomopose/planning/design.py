@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.fit import tangent_names
-from tomopose.calibration.parameters import FreeParameters, free_parameters
-from tomopose.calibration.residuals import projection_blocks
-from tomopose.calibration.uncertainty import inverse_information
+from tomopose.calibration.model.ball_projection import projection_blocks
+from tomopose.calibration.model.covariance import inverse_information
+from tomopose.calibration.model.parameters import FreeParameters, free_parameters
+from tomopose.calibration.rigid.fit import tangent_names
 from tomopose.errors import InputError, NotObservableError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.scanner import Scanner

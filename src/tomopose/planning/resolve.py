@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.estimate import best_fit
-from tomopose.calibration.fit import residuals, whitened2
-from tomopose.calibration.hypotheses import BETTER, Diagnosis, Hypothesis, ranked
-from tomopose.calibration.parameters import UNITS, free_parameters
-from tomopose.calibration.problem import Problem, pair
-from tomopose.calibration.rivals import RIVALS
+from tomopose.calibration.checks.convention_tests import BETTER, Diagnosis, Hypothesis, ranked
+from tomopose.calibration.checks.conventions import RIVALS
+from tomopose.calibration.model.parameters import UNITS, free_parameters
+from tomopose.calibration.model.problem import Problem, pair
+from tomopose.calibration.rigid.estimate import best_fit
+from tomopose.calibration.rigid.fit import residuals, whitened2
 from tomopose.geometry.projection import project_ball
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform

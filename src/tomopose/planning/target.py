@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.fit import tangent_names
-from tomopose.calibration.parameters import FreeParameters
-from tomopose.calibration.residuals import projection_blocks
+from tomopose.calibration.model.ball_projection import projection_blocks
+from tomopose.calibration.model.parameters import FreeParameters
+from tomopose.calibration.rigid.fit import tangent_names
 from tomopose.errors import InputError
 from tomopose.geometry.rotations import skew
 from tomopose.geometry.scanner import Scanner

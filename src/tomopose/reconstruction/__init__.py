@@ -8,7 +8,7 @@ from tomopose.reconstruction.line_integrals import (
     ring_offset,
 )
 from tomopose.reconstruction.path import SourcePath, source_path
-from tomopose.reconstruction.reconstruct import PAPER, reconstruct
+from tomopose.reconstruction.run import PAPER, reconstruct
 
 __all__ = [
     "PAPER",

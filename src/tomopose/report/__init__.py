@@ -4,9 +4,7 @@ Other results are reported with the same parts: a `Page` of `Section`s made of `
 blocks, rendered by `render`.
 """
 
-from tomopose.report.calibration_page import calibration_report
-from tomopose.report.history_page import comparison_report, history_report
-from tomopose.report.other_pages import matrices_report, observations_report
+from tomopose.report.figures.thumbnails import Thumbnail, thumbnail, worst_thumbnails
 from tomopose.report.page import (
     Figure,
     KeyFigure,
@@ -19,8 +17,10 @@ from tomopose.report.page import (
     render,
     write_report,
 )
-from tomopose.report.thumbnails import Thumbnail, thumbnail, worst_thumbnails
-from tomopose.report.volume_page import volume_pictures, volume_report
+from tomopose.report.pages.calibration_page import calibration_report
+from tomopose.report.pages.history_page import comparison_report, history_report
+from tomopose.report.pages.other_pages import matrices_report, observations_report
+from tomopose.report.pages.volume_page import volume_pictures, volume_report
 
 __all__ = [
     "Figure",

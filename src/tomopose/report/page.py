@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tomopose.files import plain, write_text
-from tomopose.report.thumbnails import Thumbnail, thumbnail_svg
+from tomopose.report.figures.thumbnails import Thumbnail, thumbnail_svg
 
 Tone = Literal["good", "care", "bad"]
 """How a verdict is coloured."""

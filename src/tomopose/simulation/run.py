@@ -16,21 +16,21 @@ from tomopose.geometry.projection import project_ball
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.simulation.ball import ball_in_holder, ball_positions, silhouette_centre
-from tomopose.simulation.blur import margin, to_pixels
-from tomopose.simulation.cells import HELD
-from tomopose.simulation.detector import Detector, expose
-from tomopose.simulation.effects import with_glare, with_mtf, with_scatter
-from tomopose.simulation.gvxr import add_gvxr_transmission
-from tomopose.simulation.materials import MATERIALS, Material
-from tomopose.simulation.mesh import Mesh, MeshSolid
-from tomopose.simulation.mesh_projector import add_mesh_transmission
-from tomopose.simulation.projector import add_transmission
-from tomopose.simulation.rays import Compiled, compile_solids
-from tomopose.simulation.shapes import Solid
-from tomopose.simulation.spectrum import Beam, Spectrum, condense, tube_spectrum
-from tomopose.simulation.spot import FocalSpot, Motion
-from tomopose.simulation.view import View, enclosing, shadow
+from tomopose.simulation.detector.blur import margin, to_pixels
+from tomopose.simulation.detector.detector import Detector, expose
+from tomopose.simulation.detector.scatter_glare_mtf import with_glare, with_mtf, with_scatter
+from tomopose.simulation.objects.ball import ball_in_holder, ball_positions, silhouette_centre
+from tomopose.simulation.objects.mesh import Mesh, MeshSolid
+from tomopose.simulation.objects.shapes import Solid
+from tomopose.simulation.physics.materials import MATERIALS, Material
+from tomopose.simulation.physics.spectrum import Beam, Spectrum, condense, tube_spectrum
+from tomopose.simulation.projector.analytic import add_transmission
+from tomopose.simulation.projector.cells import HELD
+from tomopose.simulation.projector.focal_spot import FocalSpot, Motion
+from tomopose.simulation.projector.gvxr import add_gvxr_transmission
+from tomopose.simulation.projector.meshes import add_mesh_transmission
+from tomopose.simulation.projector.rays import Compiled, compile_solids
+from tomopose.simulation.projector.view import View, enclosing, shadow
 from tomopose.units import Array, float_array
 
 
@@ -103,7 +103,7 @@ class SimulatedRun:
     @functools.cached_property
     def tessellated(self) -> list[tuple[Mesh, str, Frame]]:
         """(mesh, material, frame) of all that is imaged, for engines that know only triangles."""
-        from tomopose.simulation.tessellate import tessellate
+        from tomopose.simulation.objects.tessellate import tessellate
 
         return [*tessellate(self.solids), *((m.mesh, m.material, m.frame) for m in self.meshes)]
 

@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from tomopose.calibration.apply import projection_matrices
+from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.errors import InputError
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
 from tomopose.geometry.scanner import Scanner
-from tomopose.reconstruction.reconstruct import reconstruct
+from tomopose.reconstruction.run import reconstruct
 from tomopose.report.page import Figure
 from tomopose.report.style import ACCENT, ALERT, ORANGE, axis, layout
-from tomopose.studies.result import Progress, Scale, StudyCheck, StudyRow, check_below
-from tomopose.studies.section6_calibrations import kinematic, planned_run, projected, rigid
-from tomopose.studies.section6_tables import PRINTED_CYLINDER_UM
-from tomopose.studies.steps import Steps
-from tomopose.studies.virtual_hexapod import ball_run, real_T_MH, scan_of
+from tomopose.studies.parts.result import Progress, Scale, StudyCheck, StudyRow, check_below
+from tomopose.studies.parts.steps import Steps
+from tomopose.studies.parts.virtual_hexapod import ball_run, real_T_MH, scan_of
+from tomopose.studies.section6.calibrations import kinematic, planned_run, projected, rigid
+from tomopose.studies.section6.tables import PRINTED_CYLINDER_UM
 from tomopose.trajectory.scan import circular_scan
 from tomopose.units import Array
 from tomopose.volume import Volume, VoxelGrid

@@ -74,9 +74,9 @@ def rehearse(setup: DemoSetup) -> None:
     On a first run compiling takes longer than the work itself; done beside the simulation, whose kernels leave the
     interpreter free, it costs no time of its own.
     """
-    from tomopose.calibration.apply import projection_matrices
+    from tomopose.calibration.projection_matrices import projection_matrices
     from tomopose.calibration.solve import calibrate
-    from tomopose.detection.detect import detect
+    from tomopose.detection.run.detect import detect
 
     tiny = setup.scanner.cropped(u=0, v=0, n_u=REHEARSAL_PX, n_v=REHEARSAL_PX)
     middle = (REHEARSAL_PX - 1) / 2

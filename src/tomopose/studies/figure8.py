@@ -11,10 +11,10 @@ from tomopose.manipulator.poses import PoseSequence
 from tomopose.report.gather import rotation_groups
 from tomopose.report.page import Figure
 from tomopose.report.style import NO_ROTATION, ROTATION_COLOURS, axis, layout
-from tomopose.studies.hexapod_runs import solve_run
-from tomopose.studies.radiographs import measure_run, solve_as_paper
-from tomopose.studies.result import Progress, Scale, StudyCheck, StudyRow, check_below, check_between
-from tomopose.studies.steps import Steps
+from tomopose.studies.parts.hexapod_runs import solve_run
+from tomopose.studies.parts.radiographs import measure_run, solve_as_paper
+from tomopose.studies.parts.result import Progress, Scale, StudyCheck, StudyRow, check_below, check_between
+from tomopose.studies.parts.steps import Steps
 from tomopose.studies.table1 import PRINTED, ball_run
 from tomopose.units import Array
 

@@ -15,8 +15,8 @@ from tomopose.manipulator.poses import PoseSequence
 from tomopose.report.page import Figure
 from tomopose.report.style import ACCENT, ALERT, ORANGE, axis, layout, space_axis
 from tomopose.studies.demo import demo_setup, paper_scanner
-from tomopose.studies.result import Progress, Scale, StudyCheck, StudyRow, check_below
-from tomopose.studies.steps import Steps
+from tomopose.studies.parts.result import Progress, Scale, StudyCheck, StudyRow, check_below
+from tomopose.studies.parts.steps import Steps
 from tomopose.trajectory.completeness import source_path
 from tomopose.trajectory.scan import circular_scan, tilted_scan
 from tomopose.trajectory.tilt import R_HT_MOUNTED, eq11_triangle, sine_tilt

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.apply import projection_matrices
-from tomopose.calibration.kinematic import calibrate_kinematic
-from tomopose.calibration.kinematic_trajectory import object_points, rms_px, trajectory_sigma, without_object_pose
+from tomopose.calibration.identified.calibrate import calibrate_kinematic
+from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.calibration.solve import calibrate
+from tomopose.calibration.uncertainty.trajectory import object_points, rms_px, trajectory_sigma, without_object_pose
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import eq5_matrices, project_ball
 from tomopose.geometry.rotations import R_y, R_z
@@ -26,9 +26,9 @@ from tomopose.observations import BallObservations
 from tomopose.report.page import Figure
 from tomopose.report.style import ACCENT, ORANGE, axis, layout
 from tomopose.studies.demo import demo_setup, paper_scanner
-from tomopose.studies.radiographs import sigmas_of
-from tomopose.studies.result import Progress, Scale, StudyCheck, StudyRow, check_below
-from tomopose.studies.steps import Steps
+from tomopose.studies.parts.radiographs import sigmas_of
+from tomopose.studies.parts.result import Progress, Scale, StudyCheck, StudyRow, check_below
+from tomopose.studies.parts.steps import Steps
 from tomopose.studies.table1 import PRINTED
 from tomopose.trajectory.pose_grid import pose_grid
 from tomopose.trajectory.scan import tilted_scan

@@ -11,8 +11,8 @@ from typing import Any
 
 from tomopose.errors import InputError
 from tomopose.provenance import provenance
-from tomopose.studies.result import DEFAULT_SEED, Progress, Scale, StudyResult, require_scale
-from tomopose.studies.steps import Steps
+from tomopose.studies.parts.result import DEFAULT_SEED, Progress, Scale, StudyResult, require_scale
+from tomopose.studies.parts.steps import Steps
 
 PAPER: Mapping[str, str] = MappingProxyType(
     {

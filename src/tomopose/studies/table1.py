@@ -13,9 +13,9 @@ from tomopose.calibration.solve import calibrate
 from tomopose.report.page import Figure
 from tomopose.report.style import ACCENT, ORANGE, SOFT, axis, layout
 from tomopose.studies.demo import demo_setup, paper_scanner
-from tomopose.studies.radiographs import BallRun, errors_of, exact_rms, measure_run, sigmas_of, solve_as_paper
-from tomopose.studies.result import Progress, Scale, StudyCheck, StudyRow, check_below, check_between
-from tomopose.studies.steps import Steps
+from tomopose.studies.parts.radiographs import BallRun, errors_of, exact_rms, measure_run, sigmas_of, solve_as_paper
+from tomopose.studies.parts.result import Progress, Scale, StudyCheck, StudyRow, check_below, check_between
+from tomopose.studies.parts.steps import Steps
 from tomopose.trajectory.pose_grid import pose_grid
 
 NAMES = tuple(f"{what}_{c}" for what in ("t_HT", "w_HT", "t") for c in "xyz")

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.compare import compare
+from tomopose.calibration.records.compare import compare
 from tomopose.report.page import Figure
 from tomopose.report.style import ACCENT, ORANGE, SOFT, axis, layout
-from tomopose.studies.hexapod_runs import SolvedRun, solve_run
-from tomopose.studies.result import Progress, Scale, StudyCheck, StudyRow, check_below, check_between
-from tomopose.studies.steps import Steps
+from tomopose.studies.parts.hexapod_runs import SolvedRun, solve_run
+from tomopose.studies.parts.result import Progress, Scale, StudyCheck, StudyRow, check_below, check_between
+from tomopose.studies.parts.steps import Steps
+from tomopose.studies.parts.virtual_hexapod import scan_error_um
 from tomopose.studies.table1 import FACTOR, NAMES
-from tomopose.studies.virtual_hexapod import scan_error_um
 
 # Table 2: magnification -> d_rms_opt of run 1 and run 2, px (rows 1, 2 and 3, 4).
 PRINTED_D_RMS: Mapping[float, tuple[float, float]] = MappingProxyType({2.7: (0.1578, 0.1542), 5.3: (0.4960, 0.4947)})

@@ -13,11 +13,11 @@ import numpy as np
 
 from tomopose.report.page import Figure
 from tomopose.report.style import SEQUENTIAL, axis, colour_bar, layout
-from tomopose.studies import tuy_discs
 from tomopose.studies.demo import demo_setup, paper_scanner
 from tomopose.studies.figure9 import OBJECTS, WAVES, path_of
-from tomopose.studies.result import Progress, Scale, StudyCheck, StudyRow, check_below
-from tomopose.studies.steps import Steps
+from tomopose.studies.parts import tuy_discs
+from tomopose.studies.parts.result import Progress, Scale, StudyCheck, StudyRow, check_below
+from tomopose.studies.parts.steps import Steps
 from tomopose.trajectory.completeness import tuy_completeness
 from tomopose.trajectory.scan import circular_scan, tilted_scan
 from tomopose.units import Array

@@ -1,0 +1,112 @@
+"""Calibration where source and detector move and the ball stands still; d_SD fixed, or one more number a view."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from tomopose.calibration.checks.conventions import RIVALS_OF_MOVING_SCANNER
+from tomopose.calibration.identified.calibrate import calibrate_kinematic, machine_of
+from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
+from tomopose.calibration.result import Calibration
+from tomopose.calibration.solve import calibrate
+from tomopose.errors import InputError, NotConvergedError, NotObservableError
+from tomopose.geometry.scanner import Scanner
+from tomopose.manipulator.error_models import MOVING_SCANNER, corrected_poses
+from tomopose.manipulator.inverse import InverseManipulator, inverse_poses
+from tomopose.manipulator.poses import PoseSequence
+from tomopose.observations import BallObservations
+from tomopose.units import Array
+
+
+def calibrate_inverse(
+    scanner: Scanner,
+    poses: PoseSequence,
+    observations: BallObservations,
+    *,
+    manipulator: Any = None,
+    model: str = "auto",
+    d_SD_sigma: float = 0.0,
+    distances: Mapping[tuple[int, int], tuple[float, float]] | None = None,
+    **options: Any,
+) -> Calibration:
+    """Find the scanner's mount on the moved plate and the ball in the base.  Eq. (6) over the inverse chain.
+
+    Parameters
+    ----------
+    scanner, observations: as in `calibrate`; d_SR is only the origin of W in the scanner's own frame.
+    poses:        T_MH of the plate that carries source and detector; the table angle must be 0.
+    manipulator, model, distances: as in `calibrate`.
+    d_SD_sigma:   mm, standard deviation of d_SD from view to view; 0: source and detector are fixed to one another.
+                  The result's `extra` then holds "view_d_SD", the distance of every view.
+    options:      free, fix, priors, robust of `calibrate`.
+
+    Returns
+    -------
+    A calibration whose T_HT is the mount (moved plate -> T) and whose ball is given in the base.  Matrices of a scan:
+    `projection_matrices(calibration, inverse_poses(scan))`; their points are points of the standing object.
+
+    Raises
+    ------
+    As `calibrate`; NotObservableError for what says only where W begins.
+    """
+    if np.asarray(poses.alpha).any():
+        raise InputError("the arrangement with a standing object has no rotary table; alpha must be 0 in every pose")
+    if not (np.isfinite(d_SD_sigma) and d_SD_sigma >= 0):
+        raise InputError(f"d_SD_sigma is {d_SD_sigma}; a standard deviation >= 0 in mm is needed")
+    if d_SD_sigma and model == "slack":
+        raise InputError("a d_SD that differs from view to view cannot be told from poses that scatter (model slack)")
+    for name in options.get("free", ()):
+        if name == "d_SR" or name.startswith("axis"):
+            raise NotObservableError(
+                f"{name} says only where W begins on a scanner that moves as a whole; no image depends on it beside "
+                "the mount", direction=name,
+            )
+    machine = machine_of(manipulator)
+    if distances and (model == "rigid" or (model == "auto" and machine is None)):
+        raise InputError("distances between balls serve models with the manipulator's errors; give its geometry")
+    turned = inverse_poses(poses)
+    try:
+        found = calibrate(scanner, turned, observations, model="rigid", hypotheses=RIVALS_OF_MOVING_SCANNER, **options)
+    except NotConvergedError as error:
+        if isinstance(error.calibration, Calibration):
+            error.calibration = replace(error.calibration, manipulator={"arrangement": MOVING_SCANNER})
+        raise
+    if machine is not None or d_SD_sigma or model not in ("auto", "rigid"):
+        found = calibrate_kinematic(
+            scanner, turned, observations, rigid=found,
+            manipulator=None if machine is None else InverseManipulator(machine=machine),
+            model="rigid" if machine is None and model == "auto" else model, distances=distances, inverse=True,
+            view_sigma={"d_SD": d_SD_sigma} if d_SD_sigma else None,
+        )
+    block = {**found.manipulator, "arrangement": MOVING_SCANNER}
+    if not d_SD_sigma:
+        return replace(found, manipulator=block)
+    seen = observations.select(np.isin(observations.pose_id, found.pose_id))
+    d_SD, u = view_distances(found, poses, seen, d_SD_sigma=d_SD_sigma)
+    views = {"pose_id": list(seen.pose_id), "d_SD_mm": d_SD.tolist(), "u_mm": u.tolist()}
+    return replace(
+        found, manipulator={**block, "view_sigma": {"d_SD": d_SD_sigma}}, extra={**found.extra, "view_d_SD": views}
+    )
+
+
+def view_distances(
+    calibration: Calibration, poses: PoseSequence, observations: BallObservations, *, d_SD_sigma: float
+) -> tuple[Array, Array]:
+    """(d_SD, u) of each observed view, mm, (n,): its most probable value given the ball's place in that view.
+
+    The ball moves along the line from the piercing point when d_SD changes, so a ball near it tells nothing and u stays
+    d_SD_sigma.  poses: as given to `calibrate_inverse`; rows as in `observations`.
+    """
+    rows = inverse_poses(poses).select(poses.index_of(observations.pose_id))
+    real = corrected_poses(calibration.manipulator, rows)
+    centres = np.array([calibration.balls[int(i)] for i in np.asarray(rows.ball_id)])
+    b = projection_blocks(calibration.scanner, T_HT=calibration.T_HT, T_MH=real.T_MH, t=centres, alpha=rows.alpha)
+    g = b.J_scanner[:, :, SCANNER_COLUMNS.index("d_SD")]
+    Cg = np.linalg.solve(observations.covariance, g[:, :, None])[..., 0]
+    information = np.einsum("ni,ni->n", g, Cg) + 1 / d_SD_sigma**2
+    change = np.einsum("ni,ni->n", Cg, observations.x_D - b.x_D) / information
+    return calibration.scanner.d_SD + change, 1 / np.sqrt(information)

@@ -1,0 +1,160 @@
+"""What a calibration is made of: observed centres paired with poses by name, one or several runs, in plain arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from tomopose.calibration.model.ball_projection import scanner_vector, whiteners
+from tomopose.errors import InputError
+from tomopose.geometry.scanner import Scanner
+from tomopose.manipulator.poses import PIVOT_TOLERANCE_MM, PoseSequence
+from tomopose.observations import BallObservations
+from tomopose.units import Array
+
+FEWEST_POSES = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """n observed centres with the poses they belong to, in the poses' order.
+
+    scanners: one per run;  run (n,): index of the run;  index (n,): row in the run's pose table.
+    R_MH (n, 3, 3), t_MH (n, 3), alpha (n,): the poses.  ball (n,): index into ball_ids.
+    x_D (n, 2) px, covariance (n, 2, 2) px^2, W (n, 2, 2) its whitener.
+    not_seen: ids of poses whose ball was not measured, with the reason.
+    """
+
+    scanners: tuple[Scanner, ...]
+    R_MH: Array
+    t_MH: Array
+    alpha: Array
+    run: Any
+    index: Any
+    ball: Any
+    ball_ids: tuple[int, ...]
+    x_D: Array
+    covariance: Array
+    W: Array
+    pose_id: tuple[str, ...]
+    not_seen: dict[str, str]
+    time_utc: tuple[str, ...] | None = None
+    pivot: Array | None = None
+    convention: str = "pi-hexapod"
+
+    def __len__(self) -> int:
+        return len(self.pose_id)
+
+    @property
+    def scanner(self) -> Scanner:
+        return self.scanners[0]
+
+    @property
+    def s_0(self) -> Array:
+        """(runs, 13) scanner vectors at nominal values."""
+        return np.array([scanner_vector(s) for s in self.scanners])
+
+    def select(self, keep: Any) -> Problem:
+        """The observations with those indices (or that mask)."""
+        k = np.arange(len(self))[np.asarray(keep)]
+        rows: dict[str, Any] = {
+            name: np.ascontiguousarray(getattr(self, name)[k])
+            for name in ("R_MH", "t_MH", "alpha", "run", "index", "ball", "x_D", "covariance", "W")
+        }
+        return replace(
+            self,
+            **rows,
+            pose_id=tuple(self.pose_id[i] for i in k),
+            time_utc=None if self.time_utc is None else tuple(self.time_utc[i] for i in k),
+        )
+
+    def with_covariance(self, covariance: Array) -> Problem:
+        """The same centres with other covariances (n, 2, 2)."""
+        return replace(self, covariance=covariance, W=whiteners(covariance))
+
+
+def _as_runs(value: Any, kind: type) -> list[Any]:
+    return [value] if isinstance(value, kind) else list(value)
+
+
+def pair(
+    scanner: Scanner | Sequence[Scanner],
+    poses: PoseSequence | Sequence[PoseSequence],
+    observations: BallObservations | Sequence[BallObservations],
+) -> Problem:
+    """Pair observations with poses by pose_id, whatever their order; several runs where sequences are given.
+
+    Runs share the mount T_HT and, under one ball_id, the ball.  One scanner serves all runs or each has its own
+    (magnifications differ in d_SR).  In several runs ids are written RUN:ID.
+
+    Raises InputError for ids without a pose, fewer than five observed poses, and pivots that differ between runs.
+    """
+    runs_p, runs_o = _as_runs(poses, PoseSequence), _as_runs(observations, BallObservations)
+    scanners = _as_runs(scanner, Scanner)
+    if len(runs_p) != len(runs_o):
+        raise InputError(f"{len(runs_p)} pose tables but {len(runs_o)} sets of observations; each run needs both")
+    if len(scanners) == 1:
+        scanners = scanners * len(runs_p)
+    if len(scanners) != len(runs_p):
+        raise InputError(f"{len(scanners)} scanners for {len(runs_p)} runs; give one, or one for each run")
+    pivots = [p.pivot for p in runs_p if p.pivot is not None]
+    for other in pivots[1:]:
+        if np.abs(other - pivots[0]).max() > PIVOT_TOLERANCE_MM:
+            raise InputError(f"the runs have different pivots, {pivots[0]} and {other} mm; H differs between them")
+    several = len(runs_p) > 1
+    parts: dict[str, list[Any]] = {k: [] for k in ("R", "t", "alpha", "run", "index", "ball", "x", "C")}
+    ids: list[str] = []
+    times: list[str] = []
+    not_seen: dict[str, str] = {}
+    for r, (p, o) in enumerate(zip(runs_p, runs_o, strict=True)):
+        where = p.index_of(o.pose_id)
+        prefix = f"{r}:" if several else ""
+        seen = np.asarray(o.seen)
+        words = o.status or ("not seen",) * len(o)
+        not_seen |= {prefix + o.pose_id[k]: words[k] for k in np.flatnonzero(~seen)}
+        rows = np.flatnonzero(seen)
+        rows = rows[np.argsort(where[rows], kind="stable")]
+        k = where[rows]
+        parts["R"].append(p.T_MH.R[k])
+        parts["t"].append(p.T_MH.t[k])
+        parts["alpha"].append(np.asarray(p.alpha)[k])
+        parts["run"].append(np.full(len(k), r))
+        parts["index"].append(k)
+        parts["ball"].append(np.asarray(p.ball_id)[k])
+        parts["x"].append(o.x_D[rows])
+        parts["C"].append(o.covariance[rows])
+        ids += [prefix + p.pose_id[i] for i in k]
+        if p.time_utc is not None:
+            times += [p.time_utc[i] for i in k]
+    n = len(ids)
+    if n < FEWEST_POSES:
+        raise InputError(
+            f"only {n} poses have an observed ball{f' ({len(not_seen)} were not seen)' if not_seen else ''}; at least "
+            f"{FEWEST_POSES} are needed for the nine parameters of eq. (7), and some tens for a sound uncertainty"
+        )
+    balls = np.concatenate(parts["ball"])
+    ball_ids, ball = np.unique(balls, return_inverse=True)
+    if 2 * n <= 6 + 3 * len(ball_ids):
+        raise InputError(f"{n} poses give {2 * n} equations for {6 + 3 * len(ball_ids)} unknowns; image more poses")
+    C = np.ascontiguousarray(np.concatenate(parts["C"]))
+    return Problem(
+        scanners=tuple(scanners),
+        R_MH=np.ascontiguousarray(np.concatenate(parts["R"])),
+        t_MH=np.ascontiguousarray(np.concatenate(parts["t"])),
+        alpha=np.ascontiguousarray(np.concatenate(parts["alpha"])),
+        run=np.concatenate(parts["run"]).astype(np.int64),
+        index=np.concatenate(parts["index"]).astype(np.int64),
+        ball=ball.reshape(-1).astype(np.int64),
+        ball_ids=tuple(int(b) for b in ball_ids),
+        x_D=np.ascontiguousarray(np.concatenate(parts["x"])),
+        covariance=C,
+        W=np.ascontiguousarray(whiteners(C)),
+        pose_id=tuple(ids),
+        not_seen=not_seen,
+        time_utc=tuple(times) if len(times) == n else None,
+        pivot=pivots[0] if pivots else None,
+        convention=runs_p[0].convention,
+    )

@@ -1,0 +1,105 @@
+"""One optimum of eq. (7) in Python's terms, around the compiled kernel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tomopose.calibration.model.ball_projection import ProjectionBlocks, projection_blocks
+from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, translation_scale
+from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.rigid.kernel import CONVERGED, centres, levenberg_marquardt
+from tomopose.geometry.frames import Frame
+from tomopose.geometry.transforms import RigidTransform
+from tomopose.units import Array
+
+ITERATIONS = 60
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """An optimum: R_HT (3, 3), t_HT (3,), t (balls, 3), delta (f,); chi2 with priors; N = J^T J with priors."""
+
+    R_HT: Array
+    t_HT: Array
+    t: Array
+    delta: Array
+    chi2: float
+    converged: bool
+    N: Array
+
+    @property
+    def T_HT(self) -> RigidTransform:
+        return RigidTransform(R=self.R_HT, t=self.t_HT, source=Frame.H, target=Frame.T)
+
+
+def minimise(
+    problem: Problem,
+    free: FreeParameters,
+    start: Fit | tuple[Array, Array, Array],
+    *,
+    weight: Array | None = None,
+    iterations: int = ITERATIONS,
+) -> Fit:
+    """The optimum reached from a start (a fit, or R_HT, t_HT, t), with weights (n,) on the squared residuals."""
+    R, t_HT, t = (start.R_HT, start.t_HT, start.t) if isinstance(start, Fit) else start
+    delta = start.delta.copy() if isinstance(start, Fit) and len(start.delta) == len(free) else np.zeros(len(free))
+    # float64 copies: the kernel overwrites them
+    R, t_HT, t = (np.array(v, dtype=np.float64, order="C") for v in (R, t_HT, t))
+    m = 6 + 3 * len(t) + len(free)
+    N = np.zeros((m, m))
+    w = np.ones(len(problem)) if weight is None else np.ascontiguousarray(weight, dtype=np.float64)
+    chi2, status = levenberg_marquardt(
+        problem.x_D, problem.W, w, problem.R_MH, problem.t_MH, problem.alpha, problem.run, problem.ball, problem.s_0,
+        free.cols, free.col_run, free.factor, free.information, R, t_HT, t, delta, iterations, N,
+    )
+    U, _, V = np.linalg.svd(R)
+    return Fit(R_HT=U @ V, t_HT=t_HT, t=t, delta=delta, chi2=float(chi2), converged=status == CONVERGED, N=N)
+
+
+def residuals(problem: Problem, free: FreeParameters, fit: Fit) -> Array:
+    """(n, 2) px: observed minus calculated centres; NaN where a ball would be behind the source."""
+    return problem.x_D - centres(
+        problem.R_MH, problem.t_MH, problem.alpha, problem.run, problem.ball, problem.s_0, free.cols, free.col_run,
+        free.factor, np.ascontiguousarray(fit.R_HT), fit.t_HT, fit.t, fit.delta,
+    )
+
+
+def whitened2(problem: Problem, r: Array) -> Array:
+    """(n,) squared length of residuals r (n, 2) px in standard deviations of the centres."""
+    W = problem.W
+    a = W[:, 0, 0] * r[:, 0] + W[:, 0, 1] * r[:, 1]
+    b = W[:, 1, 0] * r[:, 0] + W[:, 1, 1] * r[:, 1]
+    return a * a + b * b
+
+
+def blocks(problem: Problem, free: FreeParameters, fit: Fit) -> ProjectionBlocks:
+    """Projected centres and derivatives at a fit."""
+    return projection_blocks(
+        adjusted_scanners(problem.scanners, free, fit.delta),
+        T_HT=fit.T_HT,
+        T_MH=RigidTransform(R=problem.R_MH, t=problem.t_MH, source=Frame.M, target=Frame.H),
+        t=fit.t[problem.ball],
+        alpha=problem.alpha,
+        translation_scale=translation_scale(free, fit.delta),
+        run=problem.run,
+    )
+
+
+def jacobian(problem: Problem, free: FreeParameters, b: ProjectionBlocks) -> Array:
+    """(n, 2, m): derivatives of the calculated centres by w_HT, t_HT, the balls and the freed parameters, px."""
+    n, n_b = len(problem), len(problem.ball_ids)
+    J_balls = np.zeros((n, 2, 3 * n_b))
+    column = 3 * problem.ball[:, None] + np.arange(3)
+    np.put_along_axis(J_balls, np.broadcast_to(column[:, None, :], (n, 2, 3)), b.J_t, axis=2)
+    J_free: Any = b.J_scanner[:, :, free.cols] * free.factor
+    mine = (free.col_run[None, :] < 0) | (free.col_run[None, :] == problem.run[:, None])
+    return np.concatenate([b.J_mount, J_balls, J_free * mine[:, None, :]], axis=2)
+
+
+def tangent_names(ball_ids: tuple[int, ...], free: FreeParameters) -> tuple[str, ...]:
+    """The names of the coordinates of a covariance, in order."""
+    balls = [f"t_{c}" if len(ball_ids) == 1 else f"t[{b}]_{c}" for b in ball_ids for c in "xyz"]
+    return (*(f"w_HT_{c}" for c in "xyz"), *(f"t_HT_{c}" for c in "xyz"), *balls, *free.names)

@@ -1,0 +1,296 @@
+"""The least-squares iteration of eq. (7), compiled: Levenberg-Marquardt on SO(3) x R^m, one solve or very many.
+
+The unknowns are, in order, w_HT (3), t_HT (3), the ball centres (3 each) and the deviations `delta` of the freed
+scanner parameters from their nominal values.  A freed parameter j changes column `cols[j]` of the scanner vector by
+`factor[j] delta[j]`, in run `col_run[j]` or, where that is -1, in all.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+from tomopose.calibration.model.ball_projection import project_pose
+from tomopose.units import Array
+
+CONVERGED, STALLED, OUT_OF_ITERATIONS, SINGULAR = 0, 1, 2, 3
+STEP_TOLERANCE = 1e-10
+"""The iteration ends when a step is shorter than this, measured in standard deviations of the estimate."""
+
+
+@njit(cache=True)
+def _exp_times(w: Array, R: Array, out: Array) -> None:
+    """out = exp([w]_x) R by Rodrigues' formula."""
+    a2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    if a2 < 1e-12:
+        s, c = 1.0 - a2 / 6.0, 0.5 - a2 / 24.0
+    else:
+        a = math.sqrt(a2)
+        s, c = math.sin(a) / a, (1.0 - math.cos(a)) / a2
+    for j in range(3):
+        r0, r1, r2 = R[0, j], R[1, j], R[2, j]
+        c0, c1, c2 = w[1] * r2 - w[2] * r1, w[2] * r0 - w[0] * r2, w[0] * r1 - w[1] * r0
+        out[0, j] = r0 + s * c0 + c * (w[1] * c2 - w[2] * c1)
+        out[1, j] = r1 + s * c1 + c * (w[2] * c0 - w[0] * c2)
+        out[2, j] = r2 + s * c2 + c * (w[0] * c1 - w[1] * c0)
+
+
+@njit(cache=True)
+def _solve_spd(N: Array, lam: float, g: Array, L: Array, step: Array) -> bool:
+    """step = (N + lam diag N)^-1 g by Cholesky; False where the matrix is not positive definite."""
+    m = g.shape[0]
+    for i in range(m):
+        for j in range(i + 1):
+            v = N[i, j]
+            if i == j:
+                v += lam * N[i, i]
+            for k in range(j):
+                v -= L[i, k] * L[j, k]
+            if i == j:
+                if not v > 1e-13 * N[i, i]:
+                    return False
+                L[i, i] = math.sqrt(v)
+            else:
+                L[i, j] = v / L[j, j]
+    for i in range(m):
+        v = g[i]
+        for k in range(i):
+            v -= L[i, k] * step[k]
+        step[i] = v / L[i, i]
+    for i in range(m - 1, -1, -1):
+        v = step[i]
+        for k in range(i + 1, m):
+            v -= L[k, i] * step[k]
+        step[i] = v / L[i, i]
+    return True
+
+
+@njit(cache=True)
+def _scanner_vectors(s_0: Array, cols: Any, col_run: Any, factor: Array, delta: Array, s: Array) -> None:
+    s[:] = s_0
+    for j in range(cols.shape[0]):
+        if col_run[j] < 0:
+            for r in range(s.shape[0]):
+                s[r, cols[j]] += factor[j] * delta[j]
+        else:
+            s[col_run[j], cols[j]] += factor[j] * delta[j]
+
+
+@njit(cache=True)
+def centres(
+    R_k: Array, t_k: Array, alpha: Array, run: Any, ball: Any, s_0: Array, cols: Any, col_run: Any, factor: Array,
+    R_HT: Array, t_HT: Array, t: Array, delta: Array,
+) -> Array:
+    """(n, 2) px: the calculated centres, without derivatives; NaN where a ball is behind the source."""
+    n = R_k.shape[0]
+    out = np.full((n, 2), np.nan)
+    x_H, y_T, G_H, G_T = np.empty(3), np.empty(3), np.empty((2, 3)), np.empty((2, 3))
+    J_s, R, M = np.empty((2, 13)), np.empty((3, 3)), np.empty((3, 3))
+    s = s_0.copy()
+    _scanner_vectors(s_0, cols, col_run, factor, delta, s)
+    for k in range(n):
+        project_pose(
+            s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[ball[k]], alpha[k], False, out[k], x_H, G_H, G_T, y_T, J_s, R, M
+        )
+    return out
+
+
+@njit(cache=True)
+def normal_equations(
+    x_meas: Array, W: Array, weight: Array, R_k: Array, t_k: Array, alpha: Array, run: Any, ball: Any, s: Array,
+    cols: Any, col_run: Any, factor: Array, information: Array, R_HT: Array, t_HT: Array, t: Array, delta: Array,
+    derivatives: bool, N: Array, g: Array,
+) -> float:
+    """chi2 at a point; with `derivatives` also N = J^T J and g = J^T r (r = observed - calculated, whitened).
+
+    W (n, 2, 2) whitens a residual, weight (n,) multiplies its square, information (f,) is 1/sigma^2 of the priors.
+    Infinite where a ball is behind the source.
+    """
+    n, n_b, n_f = x_meas.shape[0], t.shape[0], cols.shape[0]
+    x, x_H, y_T = np.empty(2), np.empty(3), np.empty(3)
+    G_H, G_T, J_s = np.empty((2, 3)), np.empty((2, 3)), np.zeros((2, 13))
+    R, M = np.empty((3, 3)), np.empty((3, 3))
+    w = 9 + n_f
+    a, b, where = np.empty(w), np.empty(w), np.empty(w, dtype=np.int64)
+    chi2 = 0.0
+    if derivatives:
+        N[:] = 0.0
+        g[:] = 0.0
+        for i in range(6):
+            where[i] = i
+        for j in range(n_f):
+            where[9 + j] = 6 + 3 * n_b + j
+    for k in range(n):
+        if weight[k] == 0.0:
+            continue
+        if not project_pose(
+            s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[ball[k]], alpha[k], derivatives, x, x_H, G_H, G_T, y_T, J_s, R, M
+        ):
+            return np.inf
+        du, dv = x_meas[k, 0] - x[0], x_meas[k, 1] - x[1]
+        r0 = W[k, 0, 0] * du + W[k, 0, 1] * dv
+        r1 = W[k, 1, 0] * du + W[k, 1, 1] * dv
+        chi2 += weight[k] * (r0 * r0 + r1 * r1)
+        if not derivatives:
+            continue
+        for e in range(2):
+            c = a if e == 0 else b
+            c[0] = y_T[1] * G_T[e, 2] - y_T[2] * G_T[e, 1]
+            c[1] = y_T[2] * G_T[e, 0] - y_T[0] * G_T[e, 2]
+            c[2] = y_T[0] * G_T[e, 1] - y_T[1] * G_T[e, 0]
+            for i in range(3):
+                c[3 + i] = G_T[e, i]
+                c[6 + i] = G_H[e, 0] * R_k[k, 0, i] + G_H[e, 1] * R_k[k, 1, i] + G_H[e, 2] * R_k[k, 2, i]
+            for j in range(n_f):
+                c[9 + j] = J_s[e, cols[j]] * factor[j] if col_run[j] < 0 or col_run[j] == run[k] else 0.0
+        for i in range(3):
+            where[6 + i] = 6 + 3 * ball[k] + i
+        for i in range(w):
+            u, v = a[i], b[i]
+            a[i] = W[k, 0, 0] * u + W[k, 0, 1] * v
+            b[i] = W[k, 1, 0] * u + W[k, 1, 1] * v
+        for i in range(w):
+            p, q, wi = weight[k] * a[i], weight[k] * b[i], where[i]
+            g[wi] += p * r0 + q * r1
+            for j in range(i + 1):
+                N[wi, where[j]] += p * a[j] + q * b[j]
+    for j in range(n_f):
+        chi2 += information[j] * delta[j] * delta[j]
+        if derivatives:
+            g[6 + 3 * n_b + j] -= information[j] * delta[j]
+            N[6 + 3 * n_b + j, 6 + 3 * n_b + j] += information[j]
+    if derivatives:
+        for i in range(g.shape[0]):
+            for j in range(i):
+                N[j, i] = N[i, j]
+    return chi2
+
+
+@njit(cache=True)
+def levenberg_marquardt(
+    x_meas: Array, W: Array, weight: Array, R_k: Array, t_k: Array, alpha: Array, run: Any, ball: Any, s_0: Array,
+    cols: Any, col_run: Any, factor: Array, information: Array, R_HT: Array, t_HT: Array, t: Array, delta: Array,
+    iterations: int, N: Array,
+) -> tuple[float, int]:
+    """Minimise chi2 from (R_HT, t_HT, t, delta), which are overwritten by the optimum; N becomes J^T J there.
+
+    Returns (chi2, status).
+    """
+    n_b, n_f = t.shape[0], cols.shape[0]
+    m = 6 + 3 * n_b + n_f
+    g, step, L = np.zeros(m), np.zeros(m), np.zeros((m, m))
+    g_new, N_new = np.zeros(m), np.zeros((m, m))
+    s = s_0.copy()
+    R_new, t_HT_new, t_new, delta_new = R_HT.copy(), t_HT.copy(), t.copy(), delta.copy()
+    _scanner_vectors(s_0, cols, col_run, factor, delta, s)
+    chi2 = normal_equations(
+        x_meas, W, weight, R_k, t_k, alpha, run, ball, s, cols, col_run, factor, information, R_HT, t_HT, t, delta,
+        True, N, g,
+    )
+    if not chi2 < np.inf:
+        return np.inf, SINGULAR
+    lam, grow = 1e-4, 2.0
+    for _ in range(iterations):
+        if not _solve_spd(N, lam, g, L, step):
+            lam = max(lam, 1e-8) * 10.0
+            if lam > 1e8:
+                return chi2, SINGULAR
+            continue
+        length, gain = 0.0, 0.0
+        for i in range(m):
+            length += step[i] * g[i]  # for lam -> 0 this is step^T N step
+            gain += step[i] * (g[i] + lam * N[i, i] * step[i])
+        _exp_times(step[:3], R_HT, R_new)
+        for i in range(3):
+            t_HT_new[i] = t_HT[i] + step[3 + i]
+            for j in range(n_b):
+                t_new[j, i] = t[j, i] + step[6 + 3 * j + i]
+        for j in range(n_f):
+            delta_new[j] = delta[j] + step[6 + 3 * n_b + j]
+        _scanner_vectors(s_0, cols, col_run, factor, delta_new, s)
+        chi2_new = normal_equations(
+            x_meas, W, weight, R_k, t_k, alpha, run, ball, s, cols, col_run, factor, information, R_new, t_HT_new,
+            t_new, delta_new, True, N_new, g_new,
+        )
+        small = length < STEP_TOLERANCE * STEP_TOLERANCE
+        if chi2_new < chi2 or (small and chi2_new < np.inf) or chi2_new == chi2:
+            ratio = (chi2 - chi2_new) / gain if gain > 0 else 1.0
+            R_HT[:], t_HT[:], t[:], delta[:] = R_new, t_HT_new, t_new, delta_new
+            chi2 = chi2_new
+            N[:], g[:] = N_new, g_new
+            if small and lam < 1e-3:
+                return chi2, CONVERGED
+            cut = 1.0 - (2.0 * ratio - 1.0) ** 3
+            lam *= min(max(cut, 0.02), 1.0)
+            lam = max(lam, 1e-15)
+            grow = 2.0
+        else:
+            # at the floor of rounding a step no longer lowers chi2: that is the optimum too
+            if length < 1e-12 * max(chi2, 1e-6) or length < 1e-14:
+                return chi2, CONVERGED
+            lam *= grow
+            grow *= 2.0
+            if lam > 1e12:
+                return chi2, STALLED
+    return chi2, OUT_OF_ITERATIONS
+
+
+@njit(cache=True)
+def _log_rotation(D: Array, out: Array) -> None:
+    """Rotation vector of D, angles below pi."""
+    c = min(max((D[0, 0] + D[1, 1] + D[2, 2] - 1.0) / 2.0, -1.0), 1.0)
+    v0, v1, v2 = (D[2, 1] - D[1, 2]) / 2.0, (D[0, 2] - D[2, 0]) / 2.0, (D[1, 0] - D[0, 1]) / 2.0
+    sine = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
+    f = 1.0 + sine * sine / 6.0 if sine < 1e-4 and c > 0 else math.atan2(sine, c) / sine
+    out[0], out[1], out[2] = f * v0, f * v1, f * v2
+
+
+@njit(cache=True)
+def _solve_one(
+    x: Array, W: Array, weight: Array, R_k: Array, t_k: Array, alpha: Array, run: Any, ball: Any, s_0: Array, cols: Any,
+    col_run: Any, factor: Array, information: Array, centre: Array, R_HT: Array, t_HT: Array, t: Array, delta: Array,
+    iterations: int, theta: Array,
+) -> tuple[float, int]:
+    """One solve from a start, its result written into theta (m,)."""
+    n_b, n_f = t.shape[0], cols.shape[0]
+    m = theta.shape[0]
+    R_b, t_HT_b, t_b, delta_b = R_HT.copy(), t_HT.copy(), t.copy(), delta - centre
+    s_b, N = s_0.copy(), np.zeros((m, m))
+    _scanner_vectors(s_0, cols, col_run, factor, centre, s_b)
+    chi2, status = levenberg_marquardt(
+        x, W, weight, R_k, t_k, alpha, run, ball, s_b, cols, col_run, factor, information, R_b, t_HT_b, t_b, delta_b,
+        iterations, N,
+    )
+    _log_rotation(R_b @ R_HT.T, theta)
+    theta[3:6] = t_HT_b
+    for j in range(n_b):
+        theta[6 + 3 * j:9 + 3 * j] = t_b[j]
+    for j in range(n_f):
+        theta[6 + 3 * n_b + j] = centre[j] + delta_b[j]
+    return chi2, status
+
+
+@njit(cache=True, parallel=True)
+def solve_batch(
+    x_all: Array, W: Array, weight: Array, R_all: Array, t_all: Array, alpha: Array, run: Any, ball: Any, s_0: Array,
+    cols: Any, col_run: Any, factor: Array, information: Array, prior: Array, R_HT: Array, t_HT: Array, t: Array,
+    delta: Array, iterations: int,
+) -> Any:
+    """Many solves of one plan, from one start: x_all (b, n, 2); R_all (b or 1, n, 3, 3), t_all (b or 1, n, 3).
+
+    prior (b or 1, f): centre of the prior of delta in each solve (a Monte Carlo draws it too).
+    Returns theta (b, m): w (by which R = exp(w) R_HT of the start), t_HT, t ..., delta; chi2 (b,); status (b,).
+    """
+    n_s = x_all.shape[0]
+    m = 6 + 3 * t.shape[0] + cols.shape[0]
+    theta, chi2, status = np.empty((n_s, m)), np.empty(n_s), np.empty(n_s, dtype=np.int64)
+    for b in prange(n_s):
+        i, j = b % prior.shape[0], b % R_all.shape[0]
+        chi2[b], status[b] = _solve_one(
+            x_all[b], W, weight, R_all[j], t_all[j], alpha, run, ball, s_0, cols, col_run, factor, information,
+            prior[i], R_HT, t_HT, t, delta, iterations, theta[b],
+        )
+    return theta, chi2, status

@@ -1,0 +1,150 @@
+"""What the poses can tell, in singular values and in words.
+
+A direction counts as unobservable where its predicted standard uncertainty exceeds a size that no longer helps anybody
+(`USELESS`), or where the scaled information matrix is singular within rounding.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tomopose.calibration.model.parameters import MATTERS, FreeParameters, base_name, unit_of
+from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.result import Observability
+from tomopose.calibration.rigid.fit import tangent_names
+from tomopose.units import Array
+
+USELESS_MM, USELESS_RAD, USELESS_FACTOR = 10.0, 0.1, 20.0
+"""Standard uncertainties beyond which t_HT and t, R_HT, and (times `MATTERS`) a scanner parameter count as unknown."""
+
+SINGULAR = 1e-7
+"""Smallest singular value of the column-scaled Jacobian, relative to the largest, that still counts as information."""
+
+NO_PART = 1e-3
+"""A parameter whose error of the size that matters moves all centres together by less than this (in standard
+deviations) plays no part."""
+
+SHOWN = 0.25
+"""A direction's words name the coordinates with at least this part of its largest component."""
+
+
+def scales(names: tuple[str, ...]) -> Array:
+    """(m,) natural size of each coordinate: 1 mm, 0.1 rad, or what matters of a scanner parameter."""
+    return np.array([
+        0.1 if n.startswith("w_HT") else 1.0 if n.startswith("t") and base_name(n) not in MATTERS
+        else MATTERS[base_name(n)]
+        for n in names
+    ])
+
+
+def useless(names: tuple[str, ...]) -> Array:
+    """(m,) standard uncertainty beyond which a coordinate counts as unknown."""
+    return np.array([
+        USELESS_RAD if n.startswith("w_HT") else USELESS_FACTOR * MATTERS[base_name(n)] if base_name(n) in MATTERS
+        else USELESS_MM
+        for n in names
+    ])
+
+
+def singular_values(J: Array) -> tuple[Array, Array]:
+    """Singular values of the column-normalised Jacobian (k, m), largest first, and right vectors (m, m) by rows."""
+    norm = np.linalg.norm(J, axis=0)
+    _, s, Vt = np.linalg.svd(J / np.where(norm > 0, norm, 1.0), full_matrices=False)
+    return s, Vt / np.where(norm > 0, norm, 1.0)
+
+
+def _words(names: tuple[str, ...], v: Array) -> str:
+    """A direction as "t_HT_x + 0.9 d_SR"."""
+    size = v / scales(names)
+    top = np.abs(size).max()
+    terms = [(n, x) for n, x in zip(names, v, strict=True) if abs(x) / scales((n,))[0] >= SHOWN * top]
+    unit = max(abs(x) for _, x in terms)
+    return " ".join(f"{'-' if x < 0 else '+'} {abs(x) / unit:.2g} {n}" for n, x in terms).lstrip("+ ")
+
+
+def unobservable_directions(J: Array, names: tuple[str, ...]) -> tuple[Array, list[Array]]:
+    """(singular values, directions (m,)) that the whitened Jacobian J (k, m) cannot determine to any use."""
+    s, V = singular_values(J)
+    bad = []
+    limits = useless(names)
+    for value, v in zip(s, V, strict=True):
+        # v moved by one standard deviation changes the coordinates by v / value
+        if value <= SINGULAR * s[0] or (np.abs(v) / value > limits).any():
+            bad.append(v)
+    silent = [np.eye(len(names))[j] for j in np.flatnonzero(np.linalg.norm(J, axis=0) == 0)]
+    return s, bad + silent
+
+
+def cure(problem: Problem, names: tuple[str, ...], v: Array) -> tuple[str, str]:
+    """(direction in words, what would cure it)."""
+    words = _words(names, v)
+    size = np.abs(v) / scales(names)
+    main = {base_name(n) for n, x in zip(names, size, strict=True) if x >= SHOWN * size.max()}
+    ball = [j for j, n in enumerate(names) if n.startswith(("t_x", "t_y", "t_z", "t["))]
+    moved = v[ball].reshape(-1, 3)
+    turned = problem.R_MH @ problem.R_MH[0].T
+    rotates = np.abs(turned - np.eye(3)).max() > 1e-9
+    still = np.ptp(problem.alpha) == 0.0
+    scanner_names = main & set(MATTERS)
+    if scanner_names and still:
+        return (
+            f"{words}: exactly or nearly degenerate while the table stays at one angle",
+            "add poses at another table angle, or give a prior standard deviation",
+        )
+    if "translation_scale" in scanner_names:
+        return f"{words}: only the ratio of lengths is visible", "give a prior on translation_scale or on d_SR"
+    if scanner_names:
+        return f"{words}: these poses cannot tell them apart", "add compound rotations, table angles, or a prior"
+    if len(moved) and np.abs(moved).max() >= SHOWN * size.max():
+        axis = moved[np.abs(moved).max(axis=1).argmax()]
+        axis = np.round(axis / np.linalg.norm(axis) * (np.sign(axis[np.abs(axis).argmax()]) or 1.0), 2) + 0.0
+        where = f"({axis[0]:.2f}, {axis[1]:.2f}, {axis[2]:.2f})"
+        if not rotates:
+            return (
+                f"t_HT and t cannot be told apart ({words}): no pose rotates the moved plate",
+                "add poses rotated about two different axes",
+            )
+        return (
+            f"t_HT and t cannot be told apart along the direction {where} of the moved plate ({words}): the poses turn "
+            "about that axis only",
+            "add poses rotated about another axis",
+        )
+    return f"{words} cannot be determined from these poses", "add translations and rotations in other directions"
+
+
+def assumed_report(problem: Problem, J_assumed: Array, J: Array, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Sentences on the scanner parameters that were assumed: could these data have determined them?
+
+    J (k, m) whitened Jacobian of the estimated coordinates, J_assumed (k, a) of the assumed ones `names`.
+    """
+    Q, _ = np.linalg.qr(J)
+    left = J_assumed - Q @ (Q.T @ J_assumed)
+    norm, before = np.linalg.norm(left, axis=0), np.linalg.norm(J_assumed, axis=0)
+    sentences = []
+    for name, after, raw in zip(names, norm, before, strict=True):
+        if raw * MATTERS[name] < NO_PART:
+            continue
+        if after <= 1e-9 * raw:
+            sentences.append(f"{name} is assumed: an error of it is absorbed without a trace by the mount")
+        elif 1.0 / after > MATTERS[name]:
+            unit = unit_of(name)
+            sentences.append(
+                f"{name} is assumed: these poses would show it only to {1.0 / after:.2g}{' ' + unit if unit else ''}, "
+                f"worse than the {MATTERS[name]:g}{' ' + unit if unit else ''} that matter"
+            )
+    return tuple(sentences)
+
+
+def observability(problem: Problem, free: FreeParameters, J: Array, J_assumed: Array,
+                  assumed: tuple[str, ...]) -> Observability:
+    """The report of a fit; J (n, 2, m) and J_assumed (n, 2, a) in px, without priors."""
+    names = tangent_names(problem.ball_ids, free)
+    whitened = (problem.W @ J).reshape(-1, J.shape[2])
+    s, bad = unobservable_directions(whitened, names)
+    pairs = [cure(problem, names, v) for v in bad]
+    notes = assumed_report(problem, (problem.W @ J_assumed).reshape(len(whitened), len(assumed)), whitened, assumed)
+    return Observability(
+        singular_values=s,
+        unobservable=tuple(w for w, _ in pairs),
+        notes=tuple(dict.fromkeys([*(c for _, c in pairs), *notes])),
+    )

@@ -1,0 +1,113 @@
+"""Centres that do not belong: found by leverage-corrected residuals, set aside and listed, never silently averaged in.
+
+A residual r_k with covariance C_k is compared through its own predicted covariance C_k - J_k Sigma J_k^T: an image with
+much leverage pulls the fit to itself, and its raw residual hides it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tomopose.calibration.model.covariance import inverse_information
+from tomopose.calibration.model.parameters import FreeParameters
+from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.rigid.fit import Fit, blocks, jacobian, minimise, residuals, whitened2
+from tomopose.units import Array
+
+FALSE_ALARM = 0.01
+"""Probability that a whole run of clean normal centres has one set aside."""
+
+LARGEST_SHARE = 0.2
+"""Should more of the poses fail than this share, they are not outliers: the model does not fit, and all are kept."""
+
+MEDIAN_CHI2_2 = 2.0 * math.log(2.0)
+REWEIGHTINGS = 40
+RECLASSIFICATIONS = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobustFit:
+    """fit of the rows `keep` (n,) bool; distance2 (n,): squared studentised residuals, 2 degrees of freedom each;
+    scale: robust estimate of chi2/dof; misfit: more rows fail than may be outliers, and none was set aside."""
+
+    fit: Fit
+    keep: Any
+    distance2: Array
+    scale: float
+    misfit: bool
+
+
+def limit(n: int) -> float:
+    """Largest squared studentised residual that n clean rows are allowed."""
+    return -2.0 * math.log(FALSE_ALARM / n)
+
+
+def limit_beside(found: Array, n: int) -> float:
+    """The limit for n rows once outliers of squared distances `found` are among them.
+
+    Where many rows are wrong by little, a row a little nearer is more likely one of them than a clean row far out: a
+    share p of the rows has the spread s = mean(found) / 2 instead of 1, and the limit is where both are equally likely,
+    p exp(-d^2 / 2s) / s = (1 - p) exp(-d^2 / 2).  It is never above `limit`: gross errors do not excuse small ones.
+    """
+    if not len(found):
+        return limit(n)
+    p, s = min(len(found) / n, LARGEST_SHARE), float(np.mean(found)) / 2.0
+    return min(limit(n), 2.0 * s / (s - 1.0) * math.log(s * (1.0 - p) / p))
+
+
+def studentised(problem: Problem, free: FreeParameters, fit: Fit, keep: Any) -> Array:
+    """(n,) squared residuals in their own predicted standard deviations.  Rows not kept count as predictions."""
+    b = blocks(problem, free, fit)
+    J = jacobian(problem, free, b)
+    r = problem.x_D - b.x_D
+    spread = J @ inverse_information(fit.N) @ np.swapaxes(J, 1, 2)
+    V = problem.covariance + np.where(keep[:, None, None], -spread, spread)
+    # a row that the fit follows entirely has no residual of its own: floor at one per cent of its covariance
+    value, Q = np.linalg.eigh(problem.W @ V @ np.swapaxes(problem.W, 1, 2))
+    z = (np.swapaxes(Q, 1, 2) @ (problem.W @ r[:, :, None]))[..., 0]
+    return (z**2 / np.maximum(value, 0.01)).sum(axis=1)
+
+
+def _scale(distance2: Array) -> float:
+    return float(np.median(distance2) / MEDIAN_CHI2_2)
+
+
+def robust_fit(problem: Problem, free: FreeParameters, start: Fit) -> RobustFit:
+    """The fit without the rows that do not belong, from the ordinary fit `start`."""
+    n = len(problem)
+    all_rows = np.ones(n, dtype=bool)
+    d2 = studentised(problem, free, start, all_rows)
+    scale = _scale(d2)
+    if d2.max() <= limit(n) * max(1.0, scale):
+        return RobustFit(fit=start, keep=all_rows, distance2=d2, scale=scale, misfit=False)
+    fit, weight = start, all_rows.astype(float)
+    for _ in range(REWEIGHTINGS):
+        d2 = whitened2(problem, residuals(problem, free, fit))
+        # Geman-McClure, whose influence falls to zero: a gross error does not pull at all
+        new = (1.0 + d2 / (9.0 * max(1.0, _scale(d2)))) ** -2
+        fit = minimise(problem, free, fit, weight=new, iterations=4)
+        settled = np.abs(new - weight).max() < 1e-3
+        weight = new
+        if settled:
+            break
+    keep = d2 <= limit(n) * max(1.0, _scale(d2))
+    for turn in range(2 * RECLASSIFICATIONS):
+        if keep.mean() < 1.0 - LARGEST_SHARE or 2 * keep.sum() <= fit.N.shape[0] + 4:
+            break
+        fit = minimise(problem, free, fit, weight=keep.astype(float))
+        d2 = studentised(problem, free, fit, keep)
+        scale = _scale(d2[keep])
+        unit = max(1.0, scale)
+        new_keep = d2 <= limit_beside(d2[d2 > limit(n) * unit] / unit, n) * unit
+        # a row at the border, or two that hide each other, may come and go for ever: later nothing comes back
+        new_keep &= keep | (turn < RECLASSIFICATIONS)
+        if (new_keep == keep).all():
+            return RobustFit(fit=fit, keep=keep, distance2=d2, scale=scale, misfit=False)
+        keep = new_keep
+    return RobustFit(
+        fit=start, keep=all_rows, distance2=studentised(problem, free, start, all_rows), scale=scale, misfit=True
+    )

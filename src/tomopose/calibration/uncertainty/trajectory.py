@@ -1,0 +1,148 @@
+"""How far a scan's projections are off, once the pose of the object, which no measurement depends on, is removed.
+
+The figure of merit of a trajectory: project points of the object with the estimated and with the true chain, let the
+object take the rigid pose that explains most of the difference, and take the rms of what remains.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
+from tomopose.calibration.result import Calibration
+from tomopose.geometry.rotations import exp_rotation, skew
+from tomopose.manipulator.error_models import correction, moving_scanner
+from tomopose.manipulator.poses import PoseSequence
+from tomopose.units import Array
+
+POSE_STEPS = 12
+
+
+def object_points(half: tuple[float, float, float] = (15.0, 15.0, 30.0)) -> Array:
+    """The corners (8, 3) of a box about the origin, mm."""
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, -1).T
+    return signs * np.asarray(half, dtype=np.float64)
+
+
+def point_jacobian(P: Array, x: Array) -> Array:
+    """d(u, v)/dx (n, m, 2, 3) of points x (m, 3) under matrices P (n, 3, 4)."""
+    h = np.einsum("nij,mj->nmi", P[:, :, :3], x) + P[:, None, :, 3]
+    w = h[..., 2:]
+    return (P[:, None, :2, :3] - (h[..., :2] / w)[..., None] * P[:, None, 2:, :3]) / w[..., None]
+
+
+def pixels(P: Array, x: Array) -> Array:
+    """Pixels (n, m, 2) of points x (m, 3), whatever the sign of P: the W origin of a robot's home may lie behind the
+    source, and `canonical` then turns the sign of w for the object."""
+    h = np.einsum("nij,mj->nmi", P[:, :, :3], x) + P[:, None, :, 3]
+    return h[..., :2] / h[..., 2:]
+
+
+def without_object_pose(P: Any, P_true: Any, points: Any) -> Array:
+    """Differences (n, m, 2), px, of the points' pixels under P and P_true, the best rigid object pose removed.
+
+    The pose is the one that minimises their sum of squares, found by Gauss-Newton.
+    """
+    P, P_true, x = np.asarray(P), np.asarray(P_true), np.asarray(points, dtype=np.float64)
+    target = pixels(P_true, x)
+    R, t = np.eye(3), x.mean(axis=0)
+    x = x - t
+    for _ in range(POSE_STEPS):
+        y = x @ R.T + t
+        d = pixels(P, y) - target
+        G = point_jacobian(P, y)
+        J = np.concatenate([-G @ skew(y - t), G], axis=3).reshape(-1, 6)
+        step = np.linalg.lstsq(J, -d.ravel(), rcond=None)[0]
+        R, t = exp_rotation(step[:3]) @ R, t + step[3:]
+        if np.abs(step).max() < 1e-12:
+            break
+    return pixels(P, x @ R.T + t) - target
+
+
+def rms_px(d: Array) -> float:
+    """Root mean square distance, px, of differences (..., 2)."""
+    return float(np.sqrt(np.mean(np.sum(d**2, axis=-1))))
+
+
+def trajectory_jacobian(calibration: Calibration, poses: PoseSequence, points: Any) -> tuple[Array, Array]:
+    """How the scan's pixels answer to what was estimated, with the object's rigid pose removed.
+
+    Returns J (n, m, 2, c): derivatives, px, of points (m, 3) of W at home by the coordinates of `calibration.tangent`,
+    after the rigid pose of the object that undoes most of each; and J_pose (n, m, 2, 6) by (w, t) of the plate, rad and
+    mm, in H.  `poses` are the commanded ones; identified errors of the manipulator are applied here.
+    """
+    scanner, names, R_HT = calibration.scanner, calibration.tangent, calibration.T_HT.R
+    fixed = correction(calibration.manipulator, poses)
+    T_MH = fixed.poses.T_MH
+    x = np.asarray(points, dtype=np.float64)
+    x_M = (scanner.T_TW(0.0).inv.apply(x) - calibration.T_HT.t) @ R_HT
+    n, m = len(poses), len(x)
+    J = np.zeros((n, m, 2, len(names)))
+    J_pose = np.zeros((n, m, 2, 6))
+    rigid_pose = np.zeros((n, m, 2, 6))
+    freed = [(j, name.split("[")[0]) for j, name in enumerate(names)]
+    errors = [names.index(name) for name in fixed.names]
+    for i in range(m):
+        b = projection_blocks(scanner, T_HT=calibration.T_HT, T_MH=T_MH, t=x_M[i], alpha=poses.alpha)
+        J_pose[:, i] = np.concatenate([-b.G_H @ skew(b.x_H - T_MH.t), b.G_H], axis=2)
+        rigid_pose[:, i] = np.concatenate([-b.J_t @ skew(x_M[i]), b.J_t], axis=2)
+        J[:, i, :, :6] = b.J_mount
+        J[:, i, :, errors] = np.moveaxis(J_pose[:, i] @ fixed.J, 2, 0)
+        for j, name in freed:
+            if name in SCANNER_COLUMNS or name == "pitch_ratio":
+                column, factor = ("p_u", scanner.p_v) if name == "pitch_ratio" else (name, 1.0)
+                J[:, i, :, j] = b.J_scanner[:, :, SCANNER_COLUMNS.index(column)] * factor
+    G = rigid_pose.reshape(-1, 6)
+    Q, _ = np.linalg.qr(G / np.linalg.norm(G, axis=0))
+    flat = J.reshape(-1, len(names))
+    flat = flat - Q @ (Q.T @ flat)
+    return flat.reshape(J.shape), J_pose
+
+
+def scatter_of(calibration: Calibration) -> Array:
+    """(6,) variance of (w, t) of the plate from pose to pose, rad^2 and mm^2; 0 where it is not known."""
+    found = calibration.manipulator.get("scatter")
+    if found is not None:
+        return np.concatenate([np.broadcast_to(np.asarray(found[name]) ** 2, 3) for name in ("w_rad", "t_mm")])
+    noise = calibration.extra.get("pose_noise", {"rotation_rad": 0.0, "translation_mm": 0.0})
+    return np.repeat([float(noise["rotation_rad"]) ** 2, float(noise["translation_mm"]) ** 2], 3)
+
+
+def scatter_variance(calibration: Calibration, poses: PoseSequence, x_M: Any) -> Array:
+    """(n, m, 2) px^2: what the plate's scatter from pose to pose adds to points x_M (m, 3) of the object, and that of
+    scanner parameters from view to view.
+
+    poses: where the plate stands (corrected).
+    """
+    variance, T_MH, block = scatter_of(calibration), poses.T_MH, calibration.manipulator
+    views = {SCANNER_COLUMNS.index(name): float(sigma) for name, sigma in block.get("view_sigma", {}).items()}
+    V = np.zeros((len(poses), len(x_M), 2))
+    if variance.any() or views:
+        # the scatter that the poses' residuals alone give (pose_noise) turns about the plate's origin in the table
+        about_H = "scatter" in block and moving_scanner(block)
+        for i, x in enumerate(np.asarray(x_M, dtype=np.float64)):
+            b = projection_blocks(calibration.scanner, T_HT=calibration.T_HT, T_MH=T_MH, t=x, alpha=poses.alpha)
+            lever = b.x_H if about_H else b.x_H - T_MH.t
+            J = np.concatenate([-b.G_H @ skew(lever), b.G_H], axis=2)
+            V[:, i] = (J**2) @ variance
+            for column, sigma in views.items():
+                V[:, i] += (sigma * b.J_scanner[:, :, column]) ** 2
+    return V
+
+
+def trajectory_sigma(
+    calibration: Calibration, poses: PoseSequence, points: Any, *, scatter: bool = False
+) -> Array:
+    """(n, m, 2) px: standard uncertainty of points (m, 3) of W at home in a scan, the object's rigid pose removed.
+
+    scatter: add the manipulator's scatter from pose to pose, for the single view; else the part that views share.
+    """
+    J, _ = trajectory_jacobian(calibration, poses, points)
+    V = np.einsum("nmic,cd,nmid->nmi", J, calibration.covariance, J, optimize=True)
+    if scatter:
+        x_W = np.asarray(points, dtype=np.float64)
+        x_M = (calibration.scanner.T_TW(0.0).inv.apply(x_W) - calibration.T_HT.t) @ calibration.T_HT.R
+        V = V + scatter_variance(calibration, correction(calibration.manipulator, poses).poses, x_M)
+    return np.sqrt(np.maximum(V, 0.0))

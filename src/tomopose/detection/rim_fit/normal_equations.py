@@ -1,0 +1,127 @@
+"""Normal equations of the fit: N = J' W J and g = J' W (image - model), sums over sectors of small blocks.
+
+A sector's pixels see the shape, w and the two nodes at its sides: 14 parameters, whatever the number of nodes.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from tomopose.detection.rim_fit.model import FIRST_NODE, KAPPA, SHELLS, WHITE
+
+LOCAL = FIRST_NODE + 6
+"""Parameters of a sector, in the order of the Jacobian's rows."""
+
+
+@njit(cache=True, fastmath=True)
+def sector_blocks(image, value, jacobian, first, weight, columns, low, high):  # type: ignore[no-untyped-def]
+    """(k, LOCAL + 1, LOCAL): each sector's part of N, lower triangle, and in the last row of g; shells low to high.
+
+    first: (k SHELLS + 1,) of by_sector.  columns: rows of the Jacobian that count (the others are left 0).  Within a
+    sector every entry is one sum along the pixels, which runs in registers.
+    """
+    k = (first.shape[0] - 1) // SHELLS
+    out = np.zeros((k, LOCAL + 1, LOCAL))
+    longest = 0
+    for node in range(k):
+        longest = max(longest, first[node * SHELLS + high] - first[node * SHELLS + low])
+    row = np.empty(longest)
+    for node in range(k):
+        start, stop = first[node * SHELLS + low], first[node * SHELLS + high]
+        n = stop - start
+        w, y, y_model = weight[start:stop], image[start:stop], value[start:stop]
+        for i_p in range(columns.shape[0]):
+            p = columns[i_p]
+            a = jacobian[p, start:stop]
+            total = 0.0
+            for i in range(n):
+                row[i] = a[i] * w[i]
+                total += row[i] * (y[i] - y_model[i])
+            out[node, LOCAL, p] = total
+            for i_q in range(i_p + 1):
+                q = columns[i_q]
+                b = jacobian[q, start:stop]
+                total = 0.0
+                for i in range(n):
+                    total += row[i] * b[i]
+                out[node, p, q] = total
+    return out
+
+
+@njit(cache=True)
+def assembled(blocks, share):  # type: ignore[no-untyped-def]
+    """(N (8 + 3k, 8 + 3k), upper triangle, g): the sum of the sectors' blocks, each times its `share` (k,)."""
+    k = blocks.shape[0]
+    size = FIRST_NODE + 3 * k
+    N, g = np.zeros((size, size)), np.zeros(size)
+    place = np.empty(LOCAL, np.int64)
+    for node in range(k):
+        for p in range(LOCAL):
+            place[p] = _place(p, node, k)
+        for p in range(LOCAL):
+            g[place[p]] += share[node] * blocks[node, LOCAL, p]
+            for q in range(p + 1):
+                i, j = min(place[p], place[q]), max(place[p], place[q])
+                N[i, j] += share[node] * blocks[node, p, q]
+    return N, g
+
+
+@njit(cache=True, inline="always")
+def _place(p, node, k):  # type: ignore[no-untyped-def]
+    """Where parameter p of a sector's Jacobian stands among all parameters."""
+    if p < FIRST_NODE:
+        return p
+    if p < FIRST_NODE + 3:
+        return p + 3 * node
+    return p - 3 + 3 * (node + 1 if node + 1 < k else 0)
+
+
+@njit(cache=True, fastmath=True)
+def gradient(image, value, jacobian, first, weight, columns, high):  # type: ignore[no-untyped-def]
+    """g alone of normal_equations, of the shells before `high`."""
+    k = (first.shape[0] - 1) // SHELLS
+    g = np.zeros(FIRST_NODE + 3 * k)
+    residual = weight * (image - value)
+    for node in range(k):
+        start, stop = first[node * SHELLS], first[node * SHELLS + high]
+        y = residual[start:stop]
+        for p in columns:
+            a = jacobian[p, start:stop]
+            total = 0.0
+            for i in range(stop - start):
+                total += a[i] * y[i]
+            g[_place(p, node, k)] += total
+    return g
+
+
+@njit(cache=True)
+def with_priors(N, g, active, shape, white, nodes, kappa_start, white_prior, node_precision):  # type: ignore[no-untyped-def]
+    """Rows and columns `active` of N (upper triangle) and g, priors added.
+
+    kappa_start: mean and standard deviation of kappa's prior.  white_prior: mean and precision of w's.  node_precision:
+    (3k,) of a, about the mean level, and of b and c, about 0.
+    """
+    precision, pull = np.zeros(g.shape[0]), np.zeros(g.shape[0])
+    if math.isfinite(shape[KAPPA]):
+        precision[KAPPA] = 1.0 / kappa_start**2
+        pull[KAPPA] = precision[KAPPA] * (kappa_start - shape[KAPPA])
+    precision[WHITE] = white_prior[1]
+    pull[WHITE] = white_prior[1] * (white_prior[0] - white)
+    level = np.mean(nodes[:, 0])
+    for j in range(nodes.shape[0]):
+        for c in range(3):
+            i = FIRST_NODE + 3 * j + c
+            precision[i] = node_precision[3 * j + c]
+            pull[i] = precision[i] * ((level if c == 0 else 0.0) - nodes[j, c])
+    n = active.shape[0]
+    part, right = np.zeros((n, n)), np.empty(n)
+    for i in range(n):
+        right[i] = g[active[i]] + pull[active[i]]
+        row = N[active[i]]
+        for j in range(i, n):
+            part[i, j] = row[active[j]]
+        part[i, i] += precision[active[i]]
+    return part, right

@@ -1,0 +1,191 @@
+"""From features to lengths, angles and form, each with its uncertainty.
+
+A measurand is a function of one or two feature vectors (`features.PARAMETERS`); its uncertainty follows from their
+covariances by the law of propagation (JCGM 100:2008, 5.1), with derivatives by central differences.
+
+Rules for distances:
+    plane to plane          centroid-of-second: of the second plane's centroid from the first (default)
+                            symmetric: of the two centroids along the mean normal
+    centre to centre        spheres, calottes, circles, cone apexes: the straight distance
+    centre to plane, axis   perpendicular
+    axis to axis            at the foot next to the first axis' point
+
+A length is unidirectional where an error of the edge threshold moves both ends alike, so that it cancels; bidirectional
+where both ends move apart; one-sided where only one end is a surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from tomopose.errors import InputError
+from tomopose.measurement.features.feature import Feature
+from tomopose.units import Array
+
+Kind = Literal["distance", "diameter", "angle", "apex_angle", "form", "form_95", "form_25", "position", "x", "y", "z"]
+Rule = Literal["centroid-of-second", "symmetric"]
+CENTRED = ("sphere", "calotte", "circle")
+AXIAL = ("line", "cylinder", "cone")
+UNITS = {"angle": "rad", "apex_angle": "rad"}
+REFERENCE_TEMPERATURE_C = 20.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """value and standard uncertainty u, mm or rad; dof: degrees of freedom of u; direction: uni-, bi- or one-sided."""
+
+    value: float
+    u: float
+    dof: float
+    unit: str
+    direction: str
+    method: str
+
+
+def distance(first: Feature, second: Feature, *, rule: Rule = "centroid-of-second") -> Measured:
+    """Distance of two features, mm, by the rules above.  InputError for a pair that has no rule."""
+    kinds = _class(first), _class(second)
+    if kinds == ("plane", "plane"):
+        along = np.sign(first.direction @ second.direction) or 1.0
+
+        def between(a: Array, b: Array) -> float:
+            n = a[3:6] if rule == "centroid-of-second" else a[3:6] + along * b[3:6]
+            return abs(float((b[:3] - a[:3]) @ n)) / float(np.linalg.norm(n))
+
+        direction = "unidirectional" if along > 0 else "bidirectional"
+        return _propagated(between, (first, second), "mm", direction, f"plane to plane, {rule}")
+    if kinds == ("centre", "centre"):
+        return _propagated(
+            lambda a, b: float(np.linalg.norm(a[:3] - b[:3])), (first, second), "mm", "unidirectional",
+            "centre to centre",
+        )
+    if kinds in (("centre", "plane"), ("plane", "centre")):
+        centre, plane = (first, second) if kinds[0] == "centre" else (second, first)
+        return _propagated(
+            lambda a, b: abs(float((a[:3] - b[:3]) @ b[3:6])) / float(np.linalg.norm(b[3:6])), (centre, plane), "mm",
+            "one-sided", "centre to plane",
+        )
+    if kinds in (("centre", "axis"), ("axis", "centre")):
+        centre, axis = (first, second) if kinds[0] == "centre" else (second, first)
+        return _propagated(_from_axis, (centre, axis), "mm", "unidirectional", "centre to axis")
+    if kinds == ("axis", "axis"):
+        return _propagated(_from_axis, (first, second), "mm", "unidirectional", "axis point to axis")
+    raise InputError(f"the distance of a {first.kind} and a {second.kind} has no rule")
+
+
+def diameter(feature: Feature) -> Measured:
+    """Diameter, mm; of a cone at its point."""
+    _ = feature.radius
+    return _propagated(lambda a: 2.0 * float(a[6]), (feature,), "mm", "bidirectional", "least squares")
+
+
+def angle(first: Feature, second: Feature) -> Measured:
+    """Angle between directions, rad, 0 to pi/2: between two axes or two normals; axis and plane: to the plane."""
+    mixed = (first.kind == "plane") != (second.kind == "plane")
+
+    def between(a: Array, b: Array) -> float:
+        p, q = a[3:6] / np.linalg.norm(a[3:6]), b[3:6] / np.linalg.norm(b[3:6])
+        cross, dot = float(np.linalg.norm(np.cross(p, q))), abs(float(p @ q))
+        return float(np.arctan2(dot, cross) if mixed else np.arctan2(cross, dot))
+
+    _ = first.direction, second.direction
+    return _propagated(between, (first, second), "rad", "unidirectional", "between directions")
+
+
+def apex_angle(feature: Feature) -> Measured:
+    """Full apex angle of a cone, rad."""
+    _ = feature.half_angle
+    return _propagated(lambda a: 2.0 * float(a[7]), (feature,), "rad", "unidirectional", "least squares")
+
+
+def form(feature: Feature, which: str) -> Measured:
+    """Form deviation, mm: range of all used points, narrowest shell of 95 % of them, or range of 25 patch means.
+
+    Its uncertainty is not determinable from one surface: noise adds to it on one side only.
+    """
+    words = {"form": f"range of {feature.n_used} points", "form_95": f"95 % of {feature.n_used} points",
+             "form_25": "range of 25 patch means"}
+    if which not in words:
+        raise InputError(f"{which!r} is no form deviation; {', '.join(words)} are known")
+    return Measured(value=float(getattr(feature, which)), u=np.nan, dof=np.nan, unit="mm", direction="bidirectional",
+                    method=f"{words[which]} about the least-squares {feature.kind}; outliers: {feature.outlier_rule}")
+
+
+def position(feature: Feature, nominal: Any) -> Measured:
+    """Position deviation, mm: twice the distance of the feature's point from `nominal` (3,); for an axis, across it."""
+    x = np.asarray(nominal, dtype=np.float64)
+    if x.shape != (3,):
+        raise InputError(f"a nominal position is (3,); got {x.shape}")
+    if _class(feature) == "axis":
+        return _propagated(lambda a: 2 * _from_axis(x, a), (feature,), "mm", "unidirectional", "zone diameter, of axis")
+    return _propagated(
+        lambda a: 2 * float(np.linalg.norm(a[:3] - x)), (feature,), "mm", "unidirectional", "zone diameter, of point"
+    )
+
+
+def coordinate(feature: Feature, axis: str) -> Measured:
+    """Coordinate x, y or z of the feature's point, mm, in W."""
+    if axis not in ("x", "y", "z"):
+        raise InputError(f"{axis!r} is no coordinate; x, y or z is needed")
+    k = "xyz".index(axis)
+    return _propagated(lambda a: float(a[k]), (feature,), "mm", "unidirectional", f"coordinate {axis}")
+
+
+def at_reference_temperature(measured: Measured, temperature_C: float, expansion_per_K: float) -> Measured:
+    """A length measured at a temperature, as it is at 20 C: L / (1 + alpha (T - 20))."""
+    factor = 1.0 / (1.0 + expansion_per_K * (temperature_C - REFERENCE_TEMPERATURE_C))
+    return Measured(
+        value=measured.value * factor, u=measured.u * factor, dof=measured.dof, unit=measured.unit,
+        direction=measured.direction, method=f"{measured.method}; from {temperature_C:g} to 20 C",
+    )
+
+
+def maximum_permissible_error(length: float, A_um: float, K: float | None = None, B_um: float | None = None) -> float:
+    """A + L/K, micrometres, L in mm; at most B where that is given.  All three are the user's: nothing is built in."""
+    if not A_um > 0 or (K is not None and not K > 0) or (B_um is not None and not B_um > 0):
+        raise InputError(f"MPE needs positive A_um, K and B_um; got {A_um}, {K}, {B_um}")
+    limit = A_um + (length / K if K is not None else 0.0)
+    return limit if B_um is None else min(limit, B_um)
+
+
+def _class(feature: Feature) -> str:
+    if feature.kind in CENTRED:
+        return "centre"
+    return "axis" if feature.kind in AXIAL else feature.kind
+
+
+def _from_axis(point: Array, axis: Array) -> float:
+    n = axis[3:6] / np.linalg.norm(axis[3:6])
+    d = point[:3] - axis[:3]
+    return float(np.linalg.norm(d - (d @ n) * n))
+
+
+def _propagated(
+    function: Callable[..., float], features: tuple[Feature, ...], unit: str, direction: str, method: str
+) -> Measured:
+    """The value with u^2 = sum over features of g' C g; dof by Welch and Satterthwaite (JCGM 100:2008, G.4)."""
+    vectors = [np.array(f.vector) for f in features]
+    value = function(*vectors)
+    shares = []
+    for k, f in enumerate(features):
+        u = np.sqrt(np.diag(f.covariance))
+        g = np.zeros(8)
+        for i in np.flatnonzero(u > 0):
+            h = 1e-3 * u[i] if np.isfinite(u[i]) else 1e-6
+            moved = [v.copy() for v in vectors]
+            moved[k][i] += h
+            above = function(*moved)
+            moved[k][i] -= 2 * h
+            g[i] = (above - function(*moved)) / (2 * h)
+        used = g != 0
+        shares.append(float(g[used] @ f.covariance[np.ix_(used, used)] @ g[used]))
+    variance = max(sum(shares), 0.0)
+    freedom = [max(f.dof, 1.0) for f in features]
+    weight = sum(s**2 / d for s, d in zip(shares, freedom, strict=True))
+    dof = variance**2 / weight if weight > 0 else min(freedom)
+    return Measured(value=value, u=float(np.sqrt(variance)), dof=float(dof), unit=unit, direction=direction,
+                    method=method)

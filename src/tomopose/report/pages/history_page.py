@@ -1,0 +1,166 @@
+"""Calibrations of one machine over time: what changed between two, and the control charts of many."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from tomopose.calibration.records.compare import SIGNIFICANT, Comparison
+from tomopose.calibration.records.history import ControlChart, control_chart
+from tomopose.errors import InputError
+from tomopose.report.page import CARE, GOOD, Block, Figure, Page, Section, Table, Verdict, render
+from tomopose.report.pages.checks_section import probability
+from tomopose.report.style import ACCENT, ALERT, LINE, SOFT, axis, layout
+from tomopose.report.words import meaning, number, small_unit, symbol
+from tomopose.units import MICROMETRES_PER_MM, MICRORADIANS_PER_RAD
+
+CHARTED = ("d_rms_px", "t_HT_x", "t_HT_y", "t_HT_z", "phi_HT_x", "phi_HT_y", "phi_HT_z")
+FEWEST_ENTRIES = 3
+COVERAGE_FACTOR = 2.0
+SCALES: Mapping[str, tuple[float, str]] = {
+    "mm": (MICROMETRES_PER_MM, "µm"), "rad": (MICRORADIANS_PER_RAD, "µrad"), "px": (1.0, "px"),
+}
+
+
+def comparison_report(
+    comparison: Comparison, *, labels: tuple[str, str] = ("A", "B"), title: str = "Two calibrations compared"
+) -> str:
+    """One offline HTML document about the change from one calibration to another: the questions of the paper's table 2.
+
+    labels: names of the two calibrations.
+    """
+    changed = comparison.mount_changed or comparison.p_all < SIGNIFICANT
+    units = {"w": "rad", "t": "mm"}
+    rows = []
+    for name, d, u, z, p in zip(
+        comparison.names, comparison.difference, comparison.u, comparison.z, comparison.p, strict=True
+    ):
+        unit = units.get(name.split("_")[0].split("[")[0], "")
+        rows.append(
+            [name, meaning(name), signed(d, unit), small_unit(u, unit), small_unit(COVERAGE_FACTOR * u, unit),
+             f"{z:+.2f}", probability(p)]
+        )
+    figure = Figure(
+        title="Changes in units of their standard uncertainty",
+        meaning="Each change divided by its standard uncertainty; the dashed lines are ±2.",
+        look_for="Most bars should end between the lines; t_HT and t may leave them together, and cancel in the scan.",
+        data=[
+            {
+                "type": "bar", "x": [symbol(n) for n in comparison.names], "y": comparison.z,
+                "marker": {"color": ACCENT}, "hovertemplate": "%{x}: %{y:.2f}<extra></extra>",
+            }
+        ],
+        layout=layout(
+            xaxis=axis(type="category"), yaxis=axis("change / u"), bargap=0.5,
+            shapes=[
+                {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": y, "y1": y,
+                 "line": {"color": SOFT, "dash": "dash", "width": 1}}
+                for y in (-COVERAGE_FACTOR, COVERAGE_FACTOR)
+            ],
+        ),
+        height=330,
+    )
+    table = Table(
+        title="Changes",
+        meaning=f"{labels[1]} minus {labels[0]}, the two taken as independent.",
+        columns=["coordinate", "what it is", "change", "u", "U (k = 2)", "change / u", "probability by chance"],
+        rows=rows, numeric=(2, 3, 4, 5, 6),
+    )
+    verdict = Verdict(
+        word="Changed" if changed else "Unchanged",
+        tone=CARE if changed else GOOD,
+        sentence=f"Probability of a change of the mount this large by chance: {probability(comparison.p_mount)}.",
+        reasons=comparison.words,
+    )
+    return render(
+        Page(title=title, subtitle=f"{labels[0]} → {labels[1]}", verdict=verdict,
+             sections=[Section(title="What changed", blocks=[table, figure])], footer="Written by tomopose.")
+    )
+
+
+def signed(value: float, unit: str) -> str:
+    """A change with its sign, in µm or µrad where its unit is mm or rad."""
+    factor, name = SCALES.get(unit, (1.0, unit))
+    return f"{'−' if value < 0 else '+'}{number(abs(value) * factor)} {name}".rstrip()
+
+
+def history_section(entries: Sequence[Mapping[str, Any]]) -> Section | None:
+    """Control charts of the mount and the residual; None with fewer than three entries."""
+    if len(entries) < FEWEST_ENTRIES:
+        return None
+    charts = []
+    for name in CHARTED:
+        try:
+            charts.append(control_chart(entries, name))
+        except InputError:  # a parameter that too few entries hold
+            continue
+    blocks: list[Block] = [chart_figure(chart) for chart in charts]
+    return Section(title="Over time", lead=f"{len(entries)} calibrations of this machine, oldest first.", blocks=blocks)
+
+
+def chart_figure(chart: ControlChart) -> Figure:
+    """One number over the history with its limits.  mm and rad are shown as departure from the centre line."""
+    factor, unit = SCALES.get(chart.unit, (1.0, chart.unit))
+    base = 0.0 if chart.unit == "px" else chart.centre
+    x = list(chart.time)
+    y = factor * (chart.value - base)
+    beyond = int(np.sum(chart.out))
+    trend = f"trend by chance: {probability(chart.trend_p)}"
+    lines = [
+        {"type": "scatter", "mode": "lines", "x": x, "y": factor * (limit - base), "showlegend": False,
+         "line": {"color": SOFT, "width": 1, "dash": "dash", "shape": "hvh"}, "hoverinfo": "skip"}
+        for limit in (chart.low, chart.high)
+    ]
+    bars = None if chart.name == "d_rms_px" else {
+        "type": "data", "array": COVERAGE_FACTOR * factor * chart.u, "thickness": 1.2, "width": 3, "color": ACCENT}
+    points: dict[str, Any] = {
+        "type": "scatter", "mode": "lines+markers", "x": x, "y": y, "showlegend": False,
+        "line": {"color": LINE, "width": 1.2},
+        "marker": {"size": 7, "color": [ALERT if out else ACCENT for out in chart.out]},
+        "hovertemplate": f"%{{x}}<br>%{{y:.4g}} {unit}<extra></extra>",
+    }
+    if bars is not None:
+        points["error_y"] = bars
+    words = meaning(chart.name).replace(", R = R_x R_y R_z", "") or "reprojection error"
+    departure = "" if chart.unit == "px" else ", departure from the centre line"
+    return Figure(
+        title=words[:1].upper() + words[1:],
+        meaning=f"{chart.name}{departure}; dashed: limits of three standard deviations; {beyond} beyond; {trend}.",
+        look_for="A red point or a trend means that something moved or wears.",
+        data=[*lines, points],
+        layout=layout(xaxis=axis(type="date", nticks=6), yaxis=axis(f"{chart.name.removesuffix('_px')} / {unit}")),
+        height=300,
+        wide=False,
+    )
+
+
+def history_report(entries: Sequence[Mapping[str, Any]], *, title: str = "Calibrations over time") -> str:
+    """One offline HTML document with control charts.
+
+    entries: of a history file, oldest first (`tomopose.calibration.records.history.read_history`).
+    InputError with fewer than three.
+    """
+    section = history_section(entries)
+    if section is None:
+        raise InputError(f"the history holds {len(entries)} calibrations; control charts need {FEWEST_ENTRIES}")
+    table = Table(
+        title="Entries",
+        meaning="",
+        columns=["time (UTC)", "label", "verdict", "model", "poses", "d_rms / px", "χ²/dof"],
+        rows=[
+            [e["time_utc"], e.get("label") or "–", e["verdict"], e["model"], e["n_poses"], number(e["d_rms_px"]),
+             number(e["chi2_dof"])]
+            for e in entries
+        ],
+        numeric=(4, 5, 6),
+    )
+    return render(
+        Page(
+            title=title,
+            subtitle=f"{len(entries)} calibrations, {entries[0]['time_utc']} to {entries[-1]['time_utc']}",
+            sections=[section, Section(title="All entries", blocks=[table])],
+            footer="Written by tomopose. Bars are expanded uncertainties, k = 2.",
+        )
+    )

@@ -1,0 +1,188 @@
+"""The ideal detector image of scenes that hold meshes: the same cells as `projector`, filled by drawing triangles.
+
+The rays through the pixels' corners come first.  Pixels that are not smooth list the triangles that touch them, and
+each of their cells is sampled on a Fibonacci lattice, the finer the steeper the transmission there.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from tomopose.errors import InputError
+from tomopose.geometry.frames import Frame
+from tomopose.geometry.transforms import RigidTransform
+from tomopose.simulation.objects.mesh import MeshSolid
+from tomopose.simulation.physics.attenuation import attenuated
+from tomopose.simulation.physics.spectrum import Beam
+from tomopose.simulation.projector.cells import (
+    HELD,
+    LATTICE_5,
+    LATTICE_13,
+    LATTICE_55,
+    LATTICE_233,
+    add_moments,
+    bows,
+    fill_pixel,
+    fill_smooth,
+    gather_value,
+)
+from tomopose.simulation.projector.raster import fill, gather, projected, sample, touching
+from tomopose.simulation.projector.rays import LARGEST, Compiled
+from tomopose.simulation.projector.sampling import kernel_scene, lengths, work_space
+from tomopose.simulation.projector.view import View, Window, in_bands
+
+FLAT, STEEP, STEEPEST = 2e-3, 2e-2, 0.1
+"""How far the transmission over a pixel may lie from the bilinear one of its corners to count as flat; and from where
+on the second and the third lattice are used."""
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _reach(c: Any, u: float, v: float) -> float:
+    """Length (mm) of u U + v V + O - s: what one unit of q is worth."""
+    s, O, U, V = c[10], c[11], c[12], c[13]
+    x = O[0] + u * U[0] + v * V[0] - s[0]
+    y = O[1] + u * U[1] + v * V[1] - s[1]
+    z = O[2] + u * U[2] + v * V[2] - s[2]
+    return float(np.sqrt(x * x + y * y + z * z))
+
+
+@njit(cache=True, nogil=True)
+def _transmission(c: Any, work: Any, Q: Any, L: Any, u: float, v: float) -> Any:
+    """(transmission, signature of the solids) of a ray that has the signed q sums Q (m,) in the meshes."""
+    signature = lengths(c, work, u, v)
+    if signature == 0 and not Q.any():
+        return 1.0, signature
+    d = _reach(c, u, v)
+    for m in range(len(Q)):
+        L[m] = work[2][m] + max(Q[m], 0.0) * d
+    return attenuated(c[9], L), signature
+
+
+@njit(cache=True, nogil=True)
+def _corners(
+    c: Any, depth: int, P: Any, u_0: float, v_0: float, j_0: int, j_1: int, Q: Any, I: Any, seen: Any
+) -> bool:
+    """Transmission and signature of the samples in rows j_0 to j_1; False where a list of crossings overflowed."""
+    work, L = work_space(c, depth), np.empty(Q.shape[2])
+    fill(P, j_0, j_1, Q, seen)
+    for j in range(j_0, j_1):
+        for i in range(I.shape[1]):
+            I[j, i], signature = _transmission(c, work, Q[j, i], L, u_0 + i, v_0 + j)
+            if signature < 0:
+                return False
+            seen[j, i] += signature
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _rough_cells(
+    c: Any,
+    depth: int,
+    P: Any,
+    u_0: float,
+    v_0: float,
+    I: Any,
+    rough: Any,
+    start: Any,
+    count: Any,
+    lists: Any,
+    f: int,
+    weight: float,
+    j_0: int,
+    j_1: int,
+    out: Any,
+) -> None:
+    """Add weight x moments of the cells of rough pixels in rows j_0 to j_1 to `out`."""
+    work, h = work_space(c, depth), 1.0 / f
+    bow = bows(f)
+    Q, L, M = np.empty(len(work[2])), np.empty(len(work[2])), np.empty(HELD)
+    most = 1
+    for j in range(j_0, j_1):
+        for i in range(rough.shape[1]):
+            most = max(most, count[j, i])
+    edges, planes, columns = np.empty((most, 3, 6)), np.empty((most, 11)), np.empty(most, dtype=np.int64)
+    for j in range(j_0, j_1):
+        for i in range(rough.shape[1]):
+            if not rough[j, i]:
+                continue
+            k = count[j, i]
+            gather(P, lists[start[j, i] : start[j, i] + k], edges, planes, columns)
+            f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
+            off, bump = 0.0, 0.0
+            for q in range(5):
+                x, y = LATTICE_5[q, 0] + 0.5, LATTICE_5[q, 1] + 0.5
+                Q[:] = 0.0
+                sample(k, edges, planes, columns, P[6], i + x, j + y, Q)
+                value, _ = _transmission(c, work, Q, L, u_0 + i + x, v_0 + j + y)
+                value -= (1 - y) * ((1 - x) * f_00 + x * f_01) + y * ((1 - x) * f_10 + x * f_11)
+                off, bump = max(off, abs(value)), bump + value / 5
+            if off < FLAT:
+                # The mean of x (1 - x) / 2 is 1 / 12.
+                fill_pixel(out, j, i, f, weight, bow, f_00, f_01, f_10, f_11, -6 * bump, -6 * bump)
+                continue
+            points = LATTICE_13 if off < STEEP else LATTICE_55 if off < STEEPEST else LATTICE_233
+            n, xy = len(points), (points[:, 0] * points[:, 1]).mean()
+            for a in range(f):
+                for b in range(f):
+                    M[:] = 0.0
+                    for q in range(n):
+                        x, y = points[q]
+                        Q[:] = 0.0
+                        x_q, y_q = i + (b + x + 0.5) * h, j + (a + y + 0.5) * h
+                        sample(k, edges, planes, columns, P[6], x_q, y_q, Q)
+                        value, _ = _transmission(c, work, Q, L, u_0 + x_q, v_0 + y_q)
+                        gather_value(M, value / n, x, y)
+                    add_moments(out, j * f + a, i * f + b, weight, f, M, xy, (1 - 1 / n**2) / 12)
+
+
+def add_mesh_transmission(
+    out: Any,
+    window: Window,
+    compiled: Compiled | None,
+    meshes: tuple[MeshSolid, ...],
+    materials: tuple[str, ...],
+    beam: Beam,
+    view: View,
+    T_FW: dict[Frame, RigidTransform],
+    *,
+    f: int,
+    weight: float = 1.0,
+    threads: int = 1,
+) -> None:
+    """Add weight x transmission of meshes and solids to `out`, cells as `projector.add_transmission` describes them.
+
+    materials: names of the beam's columns.
+    """
+    c = kernel_scene(compiled, beam, view, T_FW)
+    depth = 1 if compiled is None else compiled.depth
+    u_0, v_0 = window.u_0 - 0.5, window.v_0 - 0.5
+    bodies = [(m.mesh, T_FW[m.frame], materials.index(m.material)) for m in meshes]
+    P = projected(bodies, view, (u_0, v_0)).arrays
+    n_v, n_u = window.n_v, window.n_u
+    Q, I = np.zeros((n_v + 1, n_u + 1, len(materials))), np.empty((n_v + 1, n_u + 1))
+    seen, rough = np.zeros(I.shape, dtype=np.int64), np.empty((n_v, n_u), dtype=np.bool_)
+    fine = [True]
+
+    def corners(lo: int, hi: int) -> None:
+        if not _corners(c, depth, P, u_0, v_0, lo, hi, Q, I, seen):
+            fine[0] = False
+
+    in_bands(corners, n_v + 1, threads)
+    if not fine[0]:
+        raise InputError(f"a ray crosses more than {LARGEST} surfaces of one solid; split the solid in several")
+    in_bands(lambda lo, hi: fill_smooth(I, seen, f, lo, hi, weight, out, rough), n_v, threads)
+    count, start = np.zeros((n_v, n_u), dtype=np.int64), np.zeros((n_v, n_u), dtype=np.int64)
+    nothing = np.empty(0, dtype=np.int64)
+    in_bands(lambda lo, hi: touching(P, rough, lo, hi, count, start, nothing), n_v, threads)
+    start.ravel()[1:] = np.cumsum(count.ravel())[:-1]
+    lists = np.empty(int(count.sum()), dtype=np.int64)
+    count[:] = 0
+    in_bands(lambda lo, hi: touching(P, rough, lo, hi, count, start, lists), n_v, threads)
+    in_bands(
+        lambda lo, hi: _rough_cells(c, depth, P, u_0, v_0, I, rough, start, count, lists, f, weight, lo, hi, out),
+        n_v,
+        threads,
+    )

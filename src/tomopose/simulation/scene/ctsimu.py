@@ -1,0 +1,321 @@
+"""CTSimU scenarios (format 1.0 to 1.2) as runs of the virtual scanner, and runs as scenarios, as far as both go.
+
+Read: geometry of every frame, voltage, filters, windows, spot, scintillator, grey values, SNR, unsharpness, lag,
+mesh samples on the stage, materials with a formula or mass fractions.  What else a scenario asks for is named in
+`NOT_READ` and refused, never passed over.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tomopose.errors import InputError
+from tomopose.exports.ctsimu import from_ctsimu, to_ctsimu
+from tomopose.exports.panel import Given
+from tomopose.geometry.frames import Frame
+from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
+from tomopose.geometry.scanner import R_WS, Scanner
+from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.poses import PoseSequence
+from tomopose.simulation.detector.detector import Detector
+from tomopose.simulation.objects.mesh import Mesh, MeshSolid, read_mesh
+from tomopose.simulation.physics.materials import MATERIALS, Material, from_formula
+from tomopose.simulation.physics.spectrum import Spectrum, tube_spectrum
+from tomopose.simulation.projector.focal_spot import FWHM_PER_SIGMA, FocalSpot
+from tomopose.simulation.run import SimulatedRun
+
+STEADY_MM, STEADY_PX = 1e-6, 1e-6
+"""How far the intrinsic geometry may change from frame to frame; the virtual scanner's stands still."""
+STAGE_TO_M = np.diag([-1.0, -1.0, 1.0])
+"""The stage's axes are W's turned by 180 degrees about w."""
+SIGMA_PER_RESOLUTION = 2 * math.sqrt(math.log(5) / 2) / math.pi
+"""sigma of a Gaussian over its basic spatial resolution b: modulation 20 % at 1 / (2 b) (ISO 19232-5)."""
+ANODE_DENSITY = 10.0
+"""g/cm3 of an anode whose material is not in the table: no spectrum depends on it."""
+NOT_READ = (
+    ("source", "spectrum", "file"),
+    ("source", "spot", "intensity_map"),
+    ("detector", "unsharpness", "mtf"),
+    ("detector", "noise", "noise_characteristics_file"),
+    ("detector", "bad_pixel_map", "file"),
+    ("detector", "gray_value", "intensity_characteristics_file"),
+    ("detector", "gray_value", "efficiency_characteristics_file"),
+)
+
+
+def _get(content: Any, *keys: str) -> Any:
+    """A nested entry, None where any step is missing or null."""
+    for key in keys:
+        if not isinstance(content, Mapping) or content.get(key) is None:
+            return None
+        content = content[key]
+    return content
+
+
+def _number(content: Any, *keys: str, default: float | None = None) -> float | None:
+    """A parameter's value; units are those that the format takes as native (mm, kV), others are refused."""
+    entry = _get(content, *keys)
+    if entry is None:
+        return default
+    if not isinstance(entry, Mapping):
+        return float(entry)
+    if entry.get("value") is None:
+        return default
+    scale = {None: 1.0, "mm": 1.0, "um": 1e-3, "kV": 1.0, "V": 1e-3, "deg": 1.0, "px": 1.0, "g/cm^3": 1.0}
+    if entry.get("unit") not in scale:
+        raise InputError(f"CTSimU: {'.'.join(keys)} has the unit {entry['unit']!r}, which is not read here")
+    if entry.get("drifts"):
+        raise InputError(f"CTSimU: {'.'.join(keys)} drifts; only geometry may drift here")
+    return float(entry["value"]) * scale[entry.get("unit")]
+
+
+def run_from_ctsimu(content: Mapping[str, Any], *, folder: str | Path = ".", seed: int = 0) -> SimulatedRun:
+    """The run that a scenario's JSON content describes; mesh files are taken from `folder`."""
+    for path in NOT_READ:
+        if _get(content, *path) not in (None, {}) and _get(content, *path, "file") is not False:
+            raise InputError(f"CTSimU: {'.'.join(path)} is not read by the virtual scanner")
+    scanner, T_MH = _geometry(from_ctsimu(content, Given()))
+    materials = dict(MATERIALS)
+    for entry in content.get("materials") or ():
+        materials[str(entry["id"])] = _material(entry)
+    poses = PoseSequence(T_MH=T_MH, pose_id=tuple(str(k) for k in range(len(T_MH))), source="set")
+    meshes = tuple(_sample(entry, Path(folder)) for entry in content.get("samples") or ())
+    for mesh in meshes:
+        if mesh.material not in materials:
+            raise InputError(f"CTSimU: sample {mesh.name!r} is of material {mesh.material!r}, which is not defined")
+    return SimulatedRun(
+        scanner=scanner,
+        poses=poses,
+        T_HT=RigidTransform.identity(Frame.H, Frame.T),
+        T_MH=T_MH,
+        solids=(),
+        meshes=meshes,
+        materials=materials,
+        spectrum=_spectrum(content, materials),
+        detector=_detector(content, scanner),
+        seed=seed,
+        spot=_spot(content),
+    )
+
+
+def _geometry(matrices: ProjectionMatrices) -> tuple[Scanner, RigidTransform]:
+    """One scanner, and each frame's object pose in it: P = K [R | t], x_S = R x_M + t."""
+    g = matrices.decompose()
+    for name, values, steady in (("d_SD", g.d_SD, STEADY_MM), ("u_0", g.u_0, STEADY_PX), ("v_0", g.v_0, STEADY_PX)):
+        if np.ptp(values) > steady:
+            raise InputError(f"CTSimU: {name} changes by {np.ptp(values):g} over the scan; source or panel moves")
+    d_SD, u_0, v_0 = float(g.d_SD[0]), float(g.u_0[0]), float(g.v_0[0])
+    d_SR = float(np.median(np.einsum("ni,ni->n", -g.source, g.normal)))
+    scanner = Scanner(
+        d_SD=d_SD, d_SR=d_SR, p_u=matrices.p_u, p_v=matrices.p_v, u_0=u_0, v_0=v_0, n_u=matrices.n_u, n_v=matrices.n_v
+    )
+    E = np.linalg.inv(scanner.K) @ matrices.P
+    R, t = R_WS.T @ E[:, :, :3], (E[:, :, 3] - [0.0, 0.0, d_SR]) @ R_WS
+    return scanner, RigidTransform(R=R, t=t, source=Frame.M, target=Frame.H)
+
+
+def _material(entry: Mapping[str, Any]) -> Material:
+    """A material with its composition: a formula, or entries with mass fractions."""
+    density = _number(entry, "density")
+    composition = entry.get("composition")
+    if density is None or composition is None:
+        raise InputError(f"CTSimU: material {entry.get('id')!r} has no density or no composition")
+    if isinstance(composition, str):
+        return from_formula(composition, density)
+    fractions: dict[str, float] = {}
+    parts = [
+        (from_formula(str(c["formula"]["value"]), 1.0).fractions, _number(c, "mass_fraction", default=1.0) or 0.0)
+        for c in composition
+    ]
+    total = sum(share for _, share in parts)
+    for elements, share in parts:
+        for element, f in elements.items():
+            fractions[element] = fractions.get(element, 0.0) + f * share / total
+    return Material(density=density, fractions=fractions)
+
+
+def _vector(entry: Any, names: str, where: str) -> Any:
+    values = [_number(entry, name) for name in names]
+    if any(v is None for v in values):
+        raise InputError(f"CTSimU: {where} is not given along {', '.join(names)}; samples must stand on the stage")
+    return np.array(values, dtype=np.float64)
+
+
+def _sample(entry: Mapping[str, Any], folder: Path) -> MeshSolid:
+    name = str(entry.get("name", ""))
+    file, where = entry.get("file"), entry.get("position") or {}
+    file = file.get("value") if isinstance(file, Mapping) else file
+    if not file:
+        raise InputError(f"CTSimU: sample {name!r} names no mesh file")
+    if where.get("deviations"):
+        raise InputError(f"CTSimU: sample {name!r} has deviations, which are not read")
+    unit = {"mm": 1.0, "um": 1e-3, "cm": 10.0, "m": 1000.0}.get(str(entry.get("unit", "mm")))
+    scale = [_number(entry, "scaling_factor", k, default=1.0) for k in "rst"]
+    if unit is None or len(set(scale)) != 1:
+        raise InputError(f"CTSimU: sample {name!r} has the unit {entry.get('unit')!r} and scaling {scale}; not read")
+    centre = _vector(where.get("center") or where.get("centre"), "uvw", f"the centre of sample {name!r}")
+    r = _vector(where.get("vector_r"), "uvw", f"vector_r of sample {name!r}")
+    t = _vector(where.get("vector_t"), "uvw", f"vector_t of sample {name!r}")
+    r, t = r / np.linalg.norm(r), t / np.linalg.norm(t)
+    mesh = read_mesh(folder / str(file), scale=unit * float(scale[0] or 1.0))
+    axes = STAGE_TO_M @ np.column_stack([r, np.cross(t, r), t])
+    return MeshSolid(mesh=mesh.placed(R=axes, t=STAGE_TO_M @ centre), material=str(entry.get("material_id")), name=name)
+
+
+def _spectrum(content: Mapping[str, Any], materials: Mapping[str, Material]) -> Spectrum:
+    source, detector = content.get("source") or {}, content.get("detector") or {}
+    voltage = _number(source, "voltage")
+    if voltage is None:
+        raise InputError("CTSimU: source.voltage is missing")
+    if _get(source, "spectrum", "monochromatic"):
+        spectrum = Spectrum(energy=np.array([voltage]), weight=np.ones(1))
+    else:
+        angle = _number(source, "target", "angle", "emission", default=12.0)
+        spectrum = tube_spectrum(
+            voltage, anode=str(_get(source, "target", "material_id") or "W"), anode_angle_deg=float(angle or 12.0)
+        )
+    plates = [
+        *(source.get("window") or ()),
+        *(source.get("filters") or ()),
+        *((_get(detector, "window", "front")) or ()),
+        *((_get(detector, "filters", "front")) or ()),
+    ]
+    for plate in plates:
+        spectrum = spectrum.filtered(str(plate["material_id"]), _number(plate, "thickness") or 0.0, materials)
+    scintillator, thickness = (
+        _get(detector, "scintillator", "material_id"),
+        _number(detector, "scintillator", "thickness"),
+    )
+    if scintillator is None or not thickness:
+        # The format's ideal detector counts all energy that arrives.
+        return Spectrum(energy=spectrum.energy, weight=spectrum.weight * spectrum.energy)
+    return spectrum.absorbed_energy(str(scintillator), thickness, materials)
+
+
+def _spot(content: Mapping[str, Any]) -> FocalSpot:
+    u, v = (_number(content, "source", "spot", "sigma", k, default=0.0) or 0.0 for k in "uv")
+    if u > 0 and v > 0:
+        return FocalSpot(shape="gaussian", size_u=u * FWHM_PER_SIGMA, size_v=v * FWHM_PER_SIGMA)
+    u, v = (_number(content, "source", "spot", "size", k, default=0.0) or 0.0 for k in "uv")
+    return FocalSpot(shape="rectangle", size_u=u, size_v=v, method="sampled") if u > 0 and v > 0 else FocalSpot()
+
+
+def _detector(content: Mapping[str, Any], scanner: Scanner) -> Detector:
+    part = content.get("detector") or {}
+    snr = _number(part, "noise", "snr_at_imax")
+    white = _number(part, "gray_value", "imax", default=60000.0) or 60000.0
+    resolution = _number(part, "unsharpness", "basic_spatial_resolution", default=0.0) or 0.0
+    lag = _number(part, "image_lag", default=0.0) or 0.0
+    return Detector(
+        snr=math.inf if snr is None else snr,
+        white=white,
+        bits=int(_number(part, "bit_depth", default=16.0) or 16),
+        blur_sigma=SIGMA_PER_RESOLUTION * resolution / scanner.p_u,
+        lag=(lag,) if lag else (),
+    )
+
+
+def run_to_ctsimu(run: SimulatedRun) -> tuple[dict[str, Any], dict[str, Mesh]]:
+    """(scenario content, mesh files by name): geometry by the true poses, meshes in M, tessellated where analytic.
+
+    Tube, filters and scintillator are named where the run knows them; a spectrum from a table has its highest energy
+    for a voltage, and a response from a table is left out.
+    """
+    home = eq5_matrices(run.scanner, T_HT=run.T_HT, T_MH=run.T_MH, alpha=np.asarray(run.poses.alpha))
+    matrices = ProjectionMatrices(
+        P=home,
+        n_u=run.scanner.n_u,
+        n_v=run.scanner.n_v,
+        p_u=run.scanner.p_u,
+        p_v=run.scanner.p_v,
+        pose_id=run.poses.pose_id,
+        scanner=run.scanner,
+    )
+    content = to_ctsimu(matrices)
+    # The scan's volume is fixed to W at home; the bodies are fixed to M.
+    T_MW = run.scanner.T_TW(0.0) @ run.T_HT @ RigidTransform.identity(Frame.M, Frame.H)
+    files: dict[str, Mesh] = {}
+    samples = []
+    for k, (mesh, material, frame) in enumerate(run.tessellated):
+        if frame is not Frame.M:
+            raise InputError(f"a body is fixed to frame {frame.name}; a CTSimU stage carries bodies fixed to M alone")
+        file = f"body-{k}.stl"
+        files[file] = mesh.placed(R=STAGE_TO_M @ T_MW.R, t=STAGE_TO_M @ T_MW.t)
+        axes = {f"vector_{n}": {a: {"value": float(a == b)} for a in "uvw"} for n, b in (("r", "u"), ("t", "w"))}
+        centre = {a: {"value": 0.0, "unit": "mm"} for a in "uvw"}
+        samples.append(
+            {
+                "name": file,
+                "file": file,
+                "unit": "mm",
+                "material_id": material,
+                "position": {"center": centre, **axes, "deviations": []},
+            }
+        )
+    content["samples"] = samples
+    materials = {name: run.materials[name] for name in run.beam_materials}
+    source, scintillator = _source_entry(run.spectrum, run.materials, materials)
+    content["source"] |= source
+    content["materials"] = [_material_entry(name, material) for name, material in materials.items()]
+    if run.spot.shape == "gaussian":
+        content["source"]["spot"] = {
+            "sigma": {
+                "u": {"value": run.spot.size_u / FWHM_PER_SIGMA, "unit": "mm"},
+                "v": {"value": run.spot.size_v / FWHM_PER_SIGMA, "unit": "mm"},
+            }
+        }
+    d = run.detector
+    content["detector"] |= {
+        "type": "real",
+        **scintillator,
+        "bit_depth": {"value": d.bits},
+        "image_lag": {"value": sum(d.lag)},
+        "gray_value": {"imin": {"value": d.dark}, "imax": {"value": d.white}},
+        "noise": {"snr_at_imax": {"value": None if math.isinf(d.snr) else d.snr}},
+        "unsharpness": {
+            "basic_spatial_resolution": {"value": d.blur_sigma * run.scanner.p_u / SIGMA_PER_RESOLUTION, "unit": "mm"}
+        },
+    }
+    return content, files
+
+
+def _source_entry(
+    spectrum: Spectrum, known: Mapping[str, Material], named: dict[str, Material]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """(source, scintillator) of a scenario; what they are made of joins `named`."""
+
+    def plate(part: tuple[Material | str, float]) -> dict[str, Any]:
+        material, thickness = part
+        name = material if isinstance(material, str) else f"material-{len(named)}"
+        named[name] = known[name] if isinstance(material, str) else material
+        return {"material_id": name, "thickness": {"value": thickness, "unit": "mm"}}
+
+    voltage = float(spectrum.energy[-1]) if spectrum.tube is None else spectrum.tube.voltage
+    source: dict[str, Any] = {
+        "voltage": {"value": voltage, "unit": "kV"},
+        "spectrum": {"monochromatic": False, "file": None},
+        "filters": [plate(part) for part in spectrum.filters],
+    }
+    if spectrum.tube is not None:
+        anode = spectrum.tube.anode
+        named[anode] = known[anode] if anode in known else from_formula(anode, ANODE_DENSITY)
+        angle = {"emission": {"value": spectrum.tube.anode_angle_deg, "unit": "deg"}}
+        source["target"] = {"type": "reflection", "material_id": anode, "angle": angle}
+    part = spectrum.scintillator
+    return source, {} if part is None else {"scintillator": plate(part)}
+
+
+def _material_entry(name: str, material: Material) -> dict[str, Any]:
+    return {
+        "id": name,
+        "name": name,
+        "density": {"value": material.density, "unit": "g/cm^3"},
+        "composition": [
+            {"formula": {"value": e}, "mass_fraction": {"value": f}} for e, f in material.fractions.items()
+        ],
+    }

@@ -1,0 +1,98 @@
+"""What a calibration means for measured lengths: from its covariance through the matrices and the volume to the part.
+
+A wrong calibration moves each point of the reconstruction by a smooth field.  Along every principal direction of the
+covariance the points of all features are moved by that field, the features fitted and the measurands evaluated again;
+the changes add up in squares.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from tomopose.calibration.result import Calibration
+from tomopose.calibration.uncertainty.propagation import apparent_displacement
+from tomopose.calibration.uncertainty.trajectory import pixels, point_jacobian, trajectory_jacobian
+from tomopose.errors import InputError
+from tomopose.geometry.projection import eq5_matrices
+from tomopose.manipulator.error_models import correction
+from tomopose.manipulator.poses import PoseSequence
+from tomopose.measurement.features.feature import Feature
+from tomopose.measurement.measure import evaluate, refitted
+from tomopose.measurement.plan import MeasurementPlan
+from tomopose.measurement.results import MeasurementResults
+from tomopose.units import Array
+
+NODES = 3
+"""Places a side at which the field is worked out; between them it is quadratic."""
+POINTS = 300
+"""Points of a feature that are moved."""
+NOT_LINEAR = ("form", "form_95", "form_25")
+
+
+def displacement_field(calibration: Calibration, poses: PoseSequence, x_W: Array) -> Array:
+    """(m, 3, c) mm: where points x_W (m, 3) come to lie, by the coordinates of the calibration's covariance.
+
+    poses: the scan's, as commanded.  With identified errors of the manipulator the object's rigid pose is removed.
+    """
+    if "kind" not in calibration.manipulator:
+        return apparent_displacement(calibration, poses, x_W)
+    T_MH = correction(calibration.manipulator, poses).poses.T_MH
+    alpha = np.zeros(len(poses)) if poses.alpha is None else poses.alpha
+    P = eq5_matrices(calibration.scanner, T_HT=calibration.T_HT, T_MH=T_MH, alpha=alpha)
+    if not np.isfinite(pixels(P, x_W)).all():
+        raise InputError("points of the part have no image in some views; are these the scan's poses?")
+    J, _ = trajectory_jacobian(calibration, poses, x_W)
+    G = point_jacobian(P, x_W)
+    N = np.einsum("nmia,nmib->mab", G, G)
+    return -np.linalg.solve(N, np.einsum("nmia,nmic->mac", G, J, optimize=True))
+
+
+def calibration_shares(
+    results: MeasurementResults, plan: MeasurementPlan, volume: str, calibration: Calibration, poses: PoseSequence
+) -> Mapping[str, float]:
+    """Measurand -> standard uncertainty, mm or rad, that the calibration's covariance leaves in one volume's results.
+
+    Form deviations have none: they do not follow the points linearly.  InputError where the volume was not measured.
+    """
+    if volume not in results.features:
+        raise InputError(f"there are no results of a volume {volume!r}; known: {', '.join(results.volumes)}")
+    features = results.features[volume]
+    points = {n: _some(f) for n, f in features.items()}
+    everywhere = np.concatenate(list(points.values()))
+    low, high = everywhere.min(axis=0), everywhere.max(axis=0)
+    side = np.linspace(-1.0, 1.0, NODES)
+    nodes = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
+    half = np.maximum((high - low) / 2, 1e-6)
+    field = displacement_field(calibration, poses, (low + high) / 2 + nodes * half)
+    values, vectors = np.linalg.eigh(calibration.covariance)
+    directions = vectors * np.sqrt(np.maximum(values, 0.0))
+    scale, alignment = results.scale.get(volume, 1.0), results.alignments[volume]
+
+    def measured(shift: Array | None) -> dict[str, float]:
+        moved = {}
+        for name, x in points.items():
+            at = (x - (low + high) / 2) / half
+            dx = 0.0 if shift is None else _quadratic(at) @ shift
+            moved[name] = refitted(features[name], x + dx)
+        return {r.name: r.value for r in evaluate(plan, moved, alignment, scale) if r.kind not in NOT_LINEAR}
+
+    nominal = measured(None)
+    variance = dict.fromkeys(nominal, 0.0)
+    for k in np.flatnonzero(values > 0):
+        for name, value in measured(field @ directions[:, k]).items():
+            variance[name] += (value - nominal[name]) ** 2
+    return {name: math.sqrt(v) for name, v in variance.items()}
+
+
+def _some(feature: Feature) -> Array:
+    x = feature.points[feature.used]
+    return np.asarray(x[:: -(-len(x) // POINTS)])
+
+
+def _quadratic(x: Array) -> Array:
+    """(n, 27) weights of the nodes at places x (n, 3) between -1 and 1: products of Lagrange's parabolas."""
+    one = np.stack([0.5 * x * (x - 1), 1 - x**2, 0.5 * x * (x + 1)], axis=-1)
+    return np.einsum("ni,nj,nk->nijk", one[:, 0], one[:, 1], one[:, 2]).reshape(len(x), -1)
