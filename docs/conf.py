@@ -46,8 +46,9 @@ def write_reference(app: object) -> None:
         target.write_text(text, encoding="utf-8")
 
 
-def keep_docstrings_as_written(app: object, what: str, name: str, value: object, options: object,
-                               lines: list[str]) -> None:
+def keep_docstrings_as_written(
+    app: object, what: str, name: str, value: object, options: object, lines: list[str]
+) -> None:
     """Docstrings are written to be read in an editor; the page shows them so, the first paragraph as prose."""
     text = "\n".join(lines).strip()
     if not text:
@@ -60,8 +61,9 @@ def keep_docstrings_as_written(app: object, what: str, name: str, value: object,
         lines += [".. code-block:: text", "", *(f"   {line}" for line in rest.rstrip().splitlines()), ""]
 
 
-def plain_defaults(app: object, what: str, name: str, value: object, options: object, signature: str | None,
-                   returned: str | None) -> tuple[str, str | None] | None:
+def plain_defaults(
+    app: object, what: str, name: str, value: object, options: object, signature: str | None, returned: str | None
+) -> tuple[str, str | None] | None:
     """Defaults that are made anew for each object, as three dots."""
     return None if signature is None else (signature.replace("<factory>", "..."), returned)
 

@@ -27,6 +27,8 @@ def main(folder: Path) -> tp.Calibration:
     matrices = tp.projection_matrices(calibration, tp.read_poses(folder / "scan.csv"))
     tp.export(matrices, folder / "exported", formats=["astra", "rtk"])
     return calibration
+
+
 # -- end
 
 

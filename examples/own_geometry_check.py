@@ -1,6 +1,6 @@
 """Do my matrices mean what I think?  Project points by hand, through tomopose and through an exported file.
 
-    python examples/own_geometry_check.py FOLDER
+python examples/own_geometry_check.py FOLDER
 """
 
 from __future__ import annotations
@@ -21,8 +21,12 @@ def main(folder: Path) -> float:
     T_HT = tp.RigidTransform.from_angles([0.01, -0.02, 3.1], [2.0, -1.5, 4.0], source=tp.Frame.H, target=tp.Frame.T)
     scan = tilted_scan(90, eq11_triangle)
     P = tp.ProjectionMatrices(
-        P=eq5_matrices(scanner, T_HT=T_HT, T_MH=scan.T_MH, alpha=scan.alpha), n_u=scanner.n_u, n_v=scanner.n_v,
-        p_u=scanner.p_u, p_v=scanner.p_v, pose_id=scan.pose_id,
+        P=eq5_matrices(scanner, T_HT=T_HT, T_MH=scan.T_MH, alpha=scan.alpha),
+        n_u=scanner.n_u,
+        n_v=scanner.n_v,
+        p_u=scanner.p_u,
+        p_v=scanner.p_v,
+        pose_id=scan.pose_id,
     )
     points = np.array([[10.0, 5.0, -3.0], [-8.0, 12.0, 20.0]])
 

@@ -18,7 +18,14 @@ NOISE_PX = 0.02
 
 def main() -> dict[str, tp.Calibration]:
     scanner = tp.Scanner(
-        d_SD=1500.0, d_SR=283.5, p_u=0.2, p_v=0.2, u_0=1021.4, v_0=1026.8, n_u=2048, n_v=2048,
+        d_SD=1500.0,
+        d_SR=283.5,
+        p_u=0.2,
+        p_v=0.2,
+        u_0=1021.4,
+        v_0=1026.8,
+        n_u=2048,
+        n_v=2048,
         sigma={"d_SR": 0.5, "u_0": 2.0},  # not known well: half a millimetre, two pixels
     )
     T_HT = tp.RigidTransform.from_angles([0.01, -0.02, 3.1], [2.0, -1.5, 4.0], source=tp.Frame.H, target=tp.Frame.T)

@@ -80,8 +80,12 @@ def test_eq_5_projection_matrices_of_a_scan(scanner, T_HT, rng):
         R1, R2, R3 = basic_rotations(*np.radians(angles[j]))
         T_TW = homogeneous(basic_rotations(0, 0, alpha[j])[2], np.zeros(3))
         printed = (
-            printed_P_S(scanner) @ printed_T_WS(scanner.d_SR) @ T_TW @ T_HT.matrix
-            @ homogeneous(R1 @ R2 @ R3, positions[j]) @ np.linalg.inv(T_HT.matrix)
+            printed_P_S(scanner)
+            @ printed_T_WS(scanner.d_SR)
+            @ T_TW
+            @ T_HT.matrix
+            @ homogeneous(R1 @ R2 @ R3, positions[j])
+            @ np.linalg.inv(T_HT.matrix)
         )
         assert_allclose(P[j], printed, atol=1e-9)
     assert_allclose(np.linalg.norm(P[:, 2, :3], axis=1), 1, atol=1e-14)
@@ -97,8 +101,11 @@ def test_eq_6_is_eq_3_with_the_table_at_zero(scanner, T_HT, rng):
     for k in range(len(positions)):
         R1, R2, R3 = basic_rotations(*np.radians(angles[k]))
         h = (
-            printed_P_S(scanner) @ printed_T_WS(scanner.d_SR) @ T_HT.matrix
-            @ homogeneous(R1 @ R2 @ R3, positions[k]) @ np.append(t, 1)
+            printed_P_S(scanner)
+            @ printed_T_WS(scanner.d_SR)
+            @ T_HT.matrix
+            @ homogeneous(R1 @ R2 @ R3, positions[k])
+            @ np.append(t, 1)
         )
         assert_allclose(calculated[k], h[:2] / h[2], atol=PIXEL)
 

@@ -1,6 +1,6 @@
 """Detection against the Cramer-Rao bound, third-party images, peers and the disk: one command, one table.
 
-    python benchmarks/detection/run.py [--crops 200] [--magnifications 2.7,5.3] [--shared ../shared] [--skip memory]
+python benchmarks/detection/run.py [--crops 200] [--magnifications 2.7,5.3] [--shared ../shared] [--skip memory]
 """
 
 from __future__ import annotations

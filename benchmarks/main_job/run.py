@@ -69,15 +69,25 @@ def exact(mounts: int) -> None:
             print(f"  mount {k}: {error}")
             continue
         seconds.append(time.perf_counter() - begin)
-        found = np.array([
-            np.abs(cal.T_HT.t - T_HT.t).max(), np.abs(cal.t - t).max(),
-            float(rotation_angle_between(cal.T_HT.R, T_HT.R)), np.abs(scan_error(scanner, cal, T_HT, scan)).max(),
-        ])
+        found = np.array(
+            [
+                np.abs(cal.T_HT.t - T_HT.t).max(),
+                np.abs(cal.t - t).max(),
+                float(rotation_angle_between(cal.T_HT.R, T_HT.R)),
+                np.abs(scan_error(scanner, cal, T_HT, scan)).max(),
+            ]
+        )
         reached += int(found[0] < 1e-6)
         worst = np.maximum(worst, found)
-    row(f"exact centres, rows shuffled, {mounts} random mounts",
-        f"reached {reached}", f"t_HT {worst[0]:.1e} mm", f"t {worst[1]:.1e} mm", f"R {worst[2]:.1e} rad",
-        f"scan {worst[3]:.1e} px", f"median {1e3 * np.median(seconds):.1f} ms")
+    row(
+        f"exact centres, rows shuffled, {mounts} random mounts",
+        f"reached {reached}",
+        f"t_HT {worst[0]:.1e} mm",
+        f"t {worst[1]:.1e} mm",
+        f"R {worst[2]:.1e} rad",
+        f"scan {worst[3]:.1e} px",
+        f"median {1e3 * np.median(seconds):.1f} ms",
+    )
 
 
 def noise(runs: int) -> None:
@@ -102,9 +112,12 @@ def noise(runs: int) -> None:
             error = scan_error(scanner, cal, T_HT, scan)
             pixels.append(np.sqrt(np.mean(np.sum(error**2, axis=-1))))
         inside_all = np.array(inside)
-        row(f"0.0207 px, 3x3x3x7, M {magnification}, {runs} runs",
-            f"within 3 sigma {100 * (inside_all < 3).mean():.1f} %", f"scan rms {np.mean(pixels):.4f} px "
-            f"(worst {np.max(pixels):.4f})", f"189 poses: {1e3 * np.median(seconds):.1f} ms")
+        row(
+            f"0.0207 px, 3x3x3x7, M {magnification}, {runs} runs",
+            f"within 3 sigma {100 * (inside_all < 3).mean():.1f} %",
+            f"scan rms {np.mean(pixels):.4f} px (worst {np.max(pixels):.4f})",
+            f"189 poses: {1e3 * np.median(seconds):.1f} ms",
+        )
 
 
 def third_party(shared: Path) -> None:
@@ -115,27 +128,52 @@ def third_party(shared: Path) -> None:
     obs = tp.detect(images, scanner, ball_diameter=8.0, pose_id=poses.pose_id)
     x = np.array([[p["u_px"], p["v_px"]] for p in truth["poses"]])
     d = np.linalg.norm(obs.x_D - x, axis=1)
-    row("third-party images, detection", f"rms {np.sqrt(np.mean(d**2)):.5f} px", f"worst {d.max():.5f} px",
-        f"stated {np.sqrt(np.mean(np.sum(obs.sigma**2, axis=1))):.5f} px")
+    row(
+        "third-party images, detection",
+        f"rms {np.sqrt(np.mean(d**2)):.5f} px",
+        f"worst {d.max():.5f} px",
+        f"stated {np.sqrt(np.mean(np.sum(obs.sigma**2, axis=1))):.5f} px",
+    )
     cal = tp.calibrate(scanner, poses, obs)
     off = (cal.T_HT.t - truth["T_HT"]["t_mm"]) * 1e3
     R = tp.RigidTransform.from_angles(truth["T_HT"]["phi_rad"], [0, 0, 0], source=Frame.H, target=Frame.T).R
     turned = 1e6 * rotation_angle_between(R, cal.T_HT.R)
-    row("third-party images, T_HT", f"t_HT {off.round(2)} um", f"R {turned:.2f} urad",
-        f"d_rms {cal.d_rms:.5f} px", f"chi2/dof {cal.chi2_dof:.2f}", cal.verdict)
+    row(
+        "third-party images, T_HT",
+        f"t_HT {off.round(2)} um",
+        f"R {turned:.2f} urad",
+        f"d_rms {cal.d_rms:.5f} px",
+        f"chi2/dof {cal.chi2_dof:.2f}",
+        cal.verdict,
+    )
     words = ["--scanner", folder / "scanner.json", "--poses", folder / "poses.csv", "--images", folder / "radiographs"]
     for attempt in ("first (kernels compiled where not cached)", "second"):
         with tempfile.TemporaryDirectory() as out:
             begin = time.perf_counter()
-            subprocess.run([sys.executable, "-m", "tomopose", "calibrate", *map(str, words), "--out", f"{out}/cal",
-                            "--quiet", "--workers", "2"], check=True)
+            subprocess.run(
+                [
+                    sys.executable,
+                    "-m",
+                    "tomopose",
+                    "calibrate",
+                    *map(str, words),
+                    "--out",
+                    f"{out}/cal",
+                    "--quiet",
+                    "--workers",
+                    "2",
+                ],
+                check=True,
+            )
             row(f"56 frames of 701 x 701 to calibration.json, {attempt}", f"{time.perf_counter() - begin:.2f} s")
 
 
 def doors() -> None:
-    for name, code in (("import tomopose", "import tomopose"),
-                       ("tomopose --help", "from tomopose.cli.main import run; run(['--help'])"),
-                       ("python alone", "pass")):
+    for name, code in (
+        ("import tomopose", "import tomopose"),
+        ("tomopose --help", "from tomopose.cli.main import run; run(['--help'])"),
+        ("python alone", "pass"),
+    ):
         seconds = []
         for _ in range(5):
             begin = time.perf_counter()

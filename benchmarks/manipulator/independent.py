@@ -124,14 +124,32 @@ def case(kind: str, seed: int, folder: Path) -> tuple[str, list[float]]:
         np.array([machine.image(np.zeros(3), a, b, x_M, scatter) for a, b in zip(scan, turn, strict=True)])
         for scatter in (True, False)
     )
-    (folder / "scanner.json").write_text(json.dumps({
-        "schema": "tomopose/scanner/1", "d_SD_mm": D_SD, "d_SR_mm": D_SR, "p_u_mm": PITCH, "p_v_mm": PITCH,
-        "u_0_px": U_0, "v_0_px": V_0, "n_u_px": 2048, "n_v_px": 2048,
-    }))
-    (folder / "hexapod.json").write_text(json.dumps({
-        "schema": "tomopose/hexapod/1", "base_joints_mm": machine.base.tolist(),
-        "platform_joints_mm": machine.platform.tolist(), "joint_sigma_mm": SIGMA_JOINT, "leg_sigma_mm": SIGMA_JOINT,
-    }))
+    (folder / "scanner.json").write_text(
+        json.dumps(
+            {
+                "schema": "tomopose/scanner/1",
+                "d_SD_mm": D_SD,
+                "d_SR_mm": D_SR,
+                "p_u_mm": PITCH,
+                "p_v_mm": PITCH,
+                "u_0_px": U_0,
+                "v_0_px": V_0,
+                "n_u_px": 2048,
+                "n_v_px": 2048,
+            }
+        )
+    )
+    (folder / "hexapod.json").write_text(
+        json.dumps(
+            {
+                "schema": "tomopose/hexapod/1",
+                "base_joints_mm": machine.base.tolist(),
+                "platform_joints_mm": machine.platform.tolist(),
+                "joint_sigma_mm": SIGMA_JOINT,
+                "leg_sigma_mm": SIGMA_JOINT,
+            }
+        )
+    )
     table(folder / "poses.csv", COLUMNS, np.column_stack([t, angles, alpha]))
     table(folder / "scan.csv", COLUMNS, np.column_stack([np.zeros((VIEWS, 3)), scan, turn]))
     centres = np.column_stack([uv, np.full(uv.shape, SIGMA_PX)])
@@ -140,8 +158,18 @@ def case(kind: str, seed: int, folder: Path) -> tuple[str, list[float]]:
     for name in ("rigid", "auto"):
         calibration = folder / name / "calibration.json"
         calibrate = [
-            "--scanner", folder / "scanner.json", "--poses", folder / "poses.csv", "--observations", folder / "o.csv",
-            "--manipulator", folder / "hexapod.json", "--model", name, "--out", folder / name,
+            "--scanner",
+            folder / "scanner.json",
+            "--poses",
+            folder / "poses.csv",
+            "--observations",
+            folder / "o.csv",
+            "--manipulator",
+            folder / "hexapod.json",
+            "--model",
+            name,
+            "--out",
+            folder / name,
         ]
         matrices = ["--calibration", calibration, "--poses", folder / "scan.csv", "--out", folder / f"{name}.npz"]
         for verb, words in (("calibrate", calibrate), ("matrices", matrices)):

@@ -23,9 +23,7 @@ from tomopose.manipulator.real_poses import Repeatability
 from tomopose.manipulator.serial import poses_from_joints
 from tomopose.manipulator.virtual import Disturbance, real_motion
 
-SCANNER = Scanner(
-    d_SD=1500.0, d_SR=283.5, p_u=0.2, p_v=0.2, u_0=1021.37, v_0=1026.81, n_u=2048, n_v=2048
-)
+SCANNER = Scanner(d_SD=1500.0, d_SR=283.5, p_u=0.2, p_v=0.2, u_0=1021.37, v_0=1026.81, n_u=2048, n_v=2048)
 """Magnification 5.3 of the paper."""
 DETECTION_PX = 0.0207
 """rms distance of detected centres from the true ones, table 1: both coordinates together."""
@@ -65,7 +63,8 @@ def tilted_scan(T_HT: RigidTransform, *, n: int = 180, wide: bool = False) -> Po
     R = T_HT.R.T @ np.swapaxes(turn, 1, 2) @ R_y(tilt) @ turn @ T_HT.R
     return PoseSequence(
         T_MH=RigidTransform(R=R, t=np.zeros((n, 3)), source=Frame.M, target=Frame.H),
-        pose_id=tuple(str(k) for k in range(n)), alpha=alpha,
+        pose_id=tuple(str(k) for k in range(n)),
+        alpha=alpha,
     )
 
 
@@ -88,8 +87,17 @@ class Experiment:
 
 
 def experiment(
-    machine: Any, p: Any, poses: PoseSequence, scan: PoseSequence, *, T_HT: RigidTransform, balls: Any,
-    rng: np.random.Generator, believed: Any = None, disturbance: Disturbance | None = None, scanner: Scanner = SCANNER,
+    machine: Any,
+    p: Any,
+    poses: PoseSequence,
+    scan: PoseSequence,
+    *,
+    T_HT: RigidTransform,
+    balls: Any,
+    rng: np.random.Generator,
+    believed: Any = None,
+    disturbance: Disturbance | None = None,
+    scanner: Scanner = SCANNER,
     centre: Any = None,
 ) -> Experiment:
     """Image the balls on the real machine, which then executes the scan.
@@ -102,35 +110,47 @@ def experiment(
         scanner, T_HT=T_HT, T_MH=real.T_MH, t=np.asarray(balls)[np.asarray(poses.ball_id)], alpha=poses.alpha
     )
     sigma = DETECTION_PX / np.sqrt(2)
-    observations = BallObservations.from_sigma(
-        x + sigma * rng.standard_normal(x.shape), sigma, pose_id=poses.pose_id
-    )
+    observations = BallObservations.from_sigma(x + sigma * rng.standard_normal(x.shape), sigma, pose_id=poses.pose_id)
     # wear stays, warmth and scatter belong to the run
     still = replace(
         disturbance, growth_mm=(0.0, 0.0, 0.0), growth_rad=(0.0, 0.0, 0.0), scatter=Repeatability(t_mm=0.0, w_rad=0.0)
     )
     matrices = [
-        eq5_matrices(scanner, T_HT=T_HT, T_MH=real_motion(machine, scan, p, disturbance=d, rng=rng).T_MH,
-                     alpha=scan.alpha)
+        eq5_matrices(
+            scanner, T_HT=T_HT, T_MH=real_motion(machine, scan, p, disturbance=d, rng=rng).T_MH, alpha=scan.alpha
+        )
         for d in (still, disturbance)
     ]
     home = scanner.T_TW(0.0) @ T_HT
     return Experiment(
-        machine=machine if believed is None else believed, poses=poses, observations=observations, scan=scan,
-        P_true=matrices[0], P_executed=matrices[1],
+        machine=machine if believed is None else believed,
+        poses=poses,
+        observations=observations,
+        scan=scan,
+        P_true=matrices[0],
+        P_executed=matrices[1],
         points=object_points() if centre is None else home.apply(np.asarray(centre) + object_points()),
         scanner=scanner,
     )
 
 
 def hexapod_experiment(
-    machine: Any, kind: str, seed: int, *, size: float = 1.0, balls: int = 1, geometry: float = 1.0,
-    disturbance: Disturbance | None = None, wide: bool = False,
+    machine: Any,
+    kind: str,
+    seed: int,
+    *,
+    size: float = 1.0,
+    balls: int = 1,
+    geometry: float = 1.0,
+    disturbance: Disturbance | None = None,
+    wide: bool = False,
 ) -> Experiment:
     """kind: "paper" or "mixed"; geometry: factor on the file's joints; size: factor on the joint errors."""
     rng = np.random.default_rng(np.random.SeedSequence([5, seed]))
     T_HT = RigidTransform.from_angles(
-        np.array([0.0, 0.0, np.pi]) + 0.02 * rng.standard_normal(3), rng.uniform(-3, 3, 3), source=Frame.H,
+        np.array([0.0, 0.0, np.pi]) + 0.02 * rng.standard_normal(3),
+        rng.uniform(-3, 3, 3),
+        source=Frame.H,
         target=Frame.T,
     )
     exact = replace(machine, scale_sigma=0.0, geometry_sigma=0.0)  # the controller knows its own geometry
@@ -143,7 +163,14 @@ def hexapod_experiment(
         machine, base_joints=geometry * machine.base_joints, platform_joints=geometry * machine.platform_joints
     )
     return experiment(
-        exact, p, poses, tilted_scan(T_HT, wide=wide), T_HT=T_HT, balls=centres, rng=rng, believed=believed,
+        exact,
+        p,
+        poses,
+        tilted_scan(T_HT, wide=wide),
+        T_HT=T_HT,
+        balls=centres,
+        rng=rng,
+        believed=believed,
         disturbance=disturbance,
     )
 
@@ -168,8 +195,15 @@ def robot_scan(robot: Any, *, n: int = 180, tilt: float = float(np.radians(8))) 
 
 
 def robot_experiment(
-    robot: Any, seed: int, *, n: int = 200, balls: int = 1, table: bool = False, spin: float = 2.9,
-    tilt_deg: float = 20.0, shift: float = 10.0,
+    robot: Any,
+    seed: int,
+    *,
+    n: int = 200,
+    balls: int = 1,
+    table: bool = False,
+    spin: float = 2.9,
+    tilt_deg: float = 20.0,
+    shift: float = 10.0,
 ) -> Experiment:
     """The object hangs on a robot's flange before the source: n poses about its middle, then a tilted turn.
 
@@ -209,8 +243,11 @@ def scan_error(calibration: Calibration, e: Experiment) -> ScanError:
     u, u_single = (trajectory_sigma(calibration, e.scan, e.points, scatter=s) for s in (False, True))
     grow = np.einsum("nmij,mj->nmi", point_jacobian(e.P_true, e.points), e.points - e.points.mean(axis=0))
     return ScanError(
-        shared=rms_px(d), but_scale=rms_px(d - grow * np.sum(grow * d) / np.sum(grow**2)), u_shared=rms_px(u),
-        single=rms_px(d_single), u_single=rms_px(u_single),
+        shared=rms_px(d),
+        but_scale=rms_px(d - grow * np.sum(grow * d) / np.sum(grow**2)),
+        u_shared=rms_px(u),
+        single=rms_px(d_single),
+        u_single=rms_px(u_single),
         inside=float(np.mean(np.abs(d_single) < 1.96 * u_single)),
     )
 

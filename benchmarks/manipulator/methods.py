@@ -59,9 +59,7 @@ def moving_scanner(seed: int) -> tuple[float, float]:
     p[:42] = rng.standard_normal(42) * HEXAPOD.sigma[:42]
     real = inverse_poses(real_motion(HEXAPOD, poses, p, disturbance=Disturbance(), rng=rng))
     x = project_ball(SCANNER, T_HT=true, T_MH=real.T_MH, t=[4.0, -6.0, 5.0])
-    observations = BallObservations.from_sigma(
-        x + SIGMA * rng.standard_normal(x.shape), SIGMA, pose_id=poses.pose_id
-    )
+    observations = BallObservations.from_sigma(x + SIGMA * rng.standard_normal(x.shape), SIGMA, pose_id=poses.pose_id)
     angle = np.linspace(0, 2 * np.pi, 90)
     scan = PoseSequence.from_table(
         np.zeros((90, 3)), np.column_stack([5 * np.cos(angle), 5 * np.sin(angle), np.zeros(90)])

@@ -83,8 +83,13 @@ def main() -> None:
             begin = time.process_time()
             unknown = "unknown" in name
             found = calibrate_kinematic(
-                e.scanner, e.poses, e.observations, rigid=rigid, manipulator=None if unknown else e.machine,
-                model="slack" if unknown else "auto", distances=DISTANCE if "known distance" in name else None,
+                e.scanner,
+                e.poses,
+                e.observations,
+                rigid=rigid,
+                manipulator=None if unknown else e.machine,
+                model="slack" if unknown else "auto",
+                distances=DISTANCE if "known distance" in name else None,
             )
             cpu = time.process_time() - begin
             x = scan_error(found, e)

@@ -87,20 +87,33 @@ def twin_experiment(
     setup = rng.standard_normal(9) * np.repeat([0.004, 3.0, 1.0], 3)
     twin = TwinRobots(detector=robot, source=robot, source_poses=source, base=base, focus=focus)
     x = twin_blocks(
-        SCANNER, replace(twin.trusted(), source_poses=_executed(robot, source, p_source, rng)), T_HT=T_HT,
-        poses=inverse_poses(_executed(robot, poses, p, rng)), p=setup, t=np.tile(middle + BALL, (n, 1)),
+        SCANNER,
+        replace(twin.trusted(), source_poses=_executed(robot, source, p_source, rng)),
+        T_HT=T_HT,
+        poses=inverse_poses(_executed(robot, poses, p, rng)),
+        p=setup,
+        t=np.tile(middle + BALL, (n, 1)),
     ).x_D
     x = x + SIGMA_PX * rng.standard_normal((n, 2))
     return TwinExperiment(
-        scanner=SCANNER, twin=twin, poses=poses,
+        scanner=SCANNER,
+        twin=twin,
+        poses=poses,
         observations=BallObservations.from_sigma(x, SIGMA_PX, pose_id=poses.pose_id),
         mount=RigidTransform.from_angles(
-            T_HT.angles + 0.01 * rng.standard_normal(3), T_HT.t + 4 * rng.standard_normal(3), source=Frame.H,
+            T_HT.angles + 0.01 * rng.standard_normal(3),
+            T_HT.t + 4 * rng.standard_normal(3),
+            source=Frame.H,
             target=Frame.T,
         ),
-        ball=middle + BALL + 3 * rng.standard_normal(3), scan=scan, scan_source=scan_source,
+        ball=middle + BALL + 3 * rng.standard_normal(3),
+        scan=scan,
+        scan_source=scan_source,
         P_true=twin_view_matrices(
-            SCANNER, replace(twin, source_poses=scan_source), T_HT=T_HT, poses=inverse_poses(scan),
+            SCANNER,
+            replace(twin, source_poses=scan_source),
+            T_HT=T_HT,
+            poses=inverse_poses(scan),
             p=np.concatenate([p, p_source, setup]),
         ),
         middle=middle,

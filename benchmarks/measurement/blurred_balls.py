@@ -63,8 +63,9 @@ def rows(volume, centres, radius, window):
             fits.append(fit_sphere(points[mine], area=area[mine]))
         c = (np.array([f.point for f in fits]) - centres) / VOXEL
         r = np.array([f.radius for f in fits]) / VOXEL - radius
-        rms, form, d95, f25 = (np.mean([getattr(f, a) for f in fits]) / VOXEL
-                               for a in ("rms", "form", "form_95", "form_25"))
+        rms, form, d95, f25 = (
+            np.mean([getattr(f, a) for f in fits]) / VOXEL for a in ("rms", "form", "form_95", "form_25")
+        )
         return np.sqrt(np.mean(np.sum(c**2, axis=1))), r.mean(), r.std(), rms, form, d95, f25
 
     from skimage.measure import marching_cubes
@@ -106,9 +107,11 @@ def time_large(size, seed):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     wall, cpu = time.perf_counter(), time.process_time()
     found = surface(volume)
-    print(f"{size}^3, {len(found)} vertices: {time.perf_counter() - wall:.1f} s wall, "
-          f"{time.process_time() - cpu:.1f} s CPU; peak memory {before / 2**20:.2f} GB before, "
-          f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GB after")
+    print(
+        f"{size}^3, {len(found)} vertices: {time.perf_counter() - wall:.1f} s wall, "
+        f"{time.process_time() - cpu:.1f} s CPU; peak memory {before / 2**20:.2f} GB before, "
+        f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GB after"
+    )
 
 
 def main():
@@ -122,8 +125,10 @@ def main():
     if args.time:
         time_large(args.time, 1)
         return
-    print(f"bound of a centre, CNR 20: {bound(args.radius):.5f} with known levels, with levels from the 8 or 4 voxels "
-          f"on both sides {bound(args.radius, 8.0):.5f}, {bound(args.radius, 4.0):.5f}")
+    print(
+        f"bound of a centre, CNR 20: {bound(args.radius):.5f} with known levels, with levels from the 8 or 4 voxels "
+        f"on both sides {bound(args.radius, 8.0):.5f}, {bound(args.radius, 4.0):.5f}"
+    )
     print("voxels: centre rms (3-D), radius bias, radius sd, residual rms, full range, D95, 25 patches")
     table = {}
     for seed in range(1, args.seeds + 1):

@@ -46,17 +46,25 @@ def one(rng, sd, correlation):
     values += edge[0][:, None, None] * edge[1][None, :, None] * edge[2][None, None, :]
     volume = as_volume(values + noise_of(rng, grid.shape, sd, correlation), grid)
     side = {"kind": "plane", "u": [0.8, 0, 0], "v": [0, 1.0, 0], "safety_mm": 0.3, "n_points": 250}
-    plan = plan_from({
-        "schema": "tomopose/measurement-plan/1", "unit": "mm", "surface": {"background": 0.0, "material": 1.0},
-        "features": {
-            **{f"ball {k}": {"kind": "sphere", "point": b.tolist(), "radius_mm": 0.95, "n_points": 600}
-               for k, b in enumerate(balls)},
-            "top": {**side, "point": (shift[2] + [0, 0, length / 2]).tolist(), "direction": [0, 0, 1]},
-            "foot": {**side, "point": (shift[2] - [0, 0, length / 2]).tolist(), "direction": [0, 0, -1]},
-        },
-        "measurands": [{"name": "SD", "kind": "distance", "of": ["ball 0", "ball 1"]},
-                       {"name": "L", "kind": "distance", "of": ["top", "foot"]}],
-    })
+    plan = plan_from(
+        {
+            "schema": "tomopose/measurement-plan/1",
+            "unit": "mm",
+            "surface": {"background": 0.0, "material": 1.0},
+            "features": {
+                **{
+                    f"ball {k}": {"kind": "sphere", "point": b.tolist(), "radius_mm": 0.95, "n_points": 600}
+                    for k, b in enumerate(balls)
+                },
+                "top": {**side, "point": (shift[2] + [0, 0, length / 2]).tolist(), "direction": [0, 0, 1]},
+                "foot": {**side, "point": (shift[2] - [0, 0, length / 2]).tolist(), "direction": [0, 0, -1]},
+            },
+            "measurands": [
+                {"name": "SD", "kind": "distance", "of": ["ball 0", "ball 1"]},
+                {"name": "L", "kind": "distance", "of": ["top", "foot"]},
+            ],
+        }
+    )
     found = measure(volume, plan).results
     return list(zip(found, (float(np.linalg.norm(balls[1] - balls[0])), length), strict=True))
 
@@ -70,8 +78,11 @@ def coverage(runs, sd, correlation, seed=0):
     out = {}
     for name, rows in table.items():
         e, u, U = np.array(rows).T
-        out[name] = float(np.mean(np.abs(e) <= U)), float(np.sqrt(np.mean(e**2) / np.mean(u**2))), float(
-            np.mean(e) / np.sqrt(np.mean(u**2)))
+        out[name] = (
+            float(np.mean(np.abs(e) <= U)),
+            float(np.sqrt(np.mean(e**2) / np.mean(u**2))),
+            float(np.mean(e) / np.sqrt(np.mean(u**2))),
+        )
     return out
 
 
@@ -82,8 +93,10 @@ def main():
     parser.add_argument("--correlation", type=float, default=0.0)
     args = parser.parse_args()
     for name, (share, ratio, bias) in coverage(args.runs, args.noise, args.correlation).items():
-        print(f"{name}: {100 * share:.1f} % of {args.runs} intervals hold the truth; rms error / u {ratio:.3f}, "
-              f"mean error {bias:+.3f} u")
+        print(
+            f"{name}: {100 * share:.1f} % of {args.runs} intervals hold the truth; rms error / u {ratio:.3f}, "
+            f"mean error {bias:+.3f} u"
+        )
 
 
 if __name__ == "__main__":

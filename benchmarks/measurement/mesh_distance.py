@@ -1,6 +1,6 @@
 """Half a million points with known distances against a mesh of about 137,000 triangles.
 
-    python benchmarks/measurement/mesh/distance.py [--points 500000]
+python benchmarks/measurement/mesh/distance.py [--points 500000]
 """
 
 from __future__ import annotations
@@ -38,8 +38,10 @@ def main():
     turned = Mesh(points=mesh.points @ turn.T, faces=mesh.faces)
     wall, cpu = time.perf_counter(), time.process_time()
     found = signed_distances(x @ turn.T, turned)
-    print(f"{args.points} points, {len(mesh.faces)} triangles: {time.perf_counter() - wall:.1f} s wall, "
-          f"{time.process_time() - cpu:.1f} s CPU, largest error {np.abs(found - truth).max():.1e} mm")
+    print(
+        f"{args.points} points, {len(mesh.faces)} triangles: {time.perf_counter() - wall:.1f} s wall, "
+        f"{time.process_time() - cpu:.1f} s CPU, largest error {np.abs(found - truth).max():.1e} mm"
+    )
 
 
 if __name__ == "__main__":

@@ -114,14 +114,19 @@ def speed(views: int, block: int = 15) -> Result:
         own, peer = pair["own"], pair["rtk"]
         work = samples if name.startswith("forward") else updates
         result[name] = {
-            "own_cpu_s": own.cpu, "own_wall_s": own.wall, "rtk_cpu_s": peer.cpu, "rtk_wall_s": peer.wall,
-            "ratio_cpu": peer.cpu / own.cpu, "ratio_wall": peer.wall / own.wall,
+            "own_cpu_s": own.cpu,
+            "own_wall_s": own.wall,
+            "rtk_cpu_s": peer.cpu,
+            "rtk_wall_s": peer.wall,
+            "ratio_cpu": peer.cpu / own.cpu,
+            "ratio_wall": peer.wall / own.wall,
             "own_rate_2_idle_cores": 2 * work / own.cpu,
             "unit": "1e9 samples/s" if name.startswith("forward") else "1e9 voxel updates/s",
         }
         print(
             f"{name:20s} own {own.cpu:7.2f} cpu s ({own.wall:6.1f} wall), rtk {peer.cpu:7.2f} cpu s ({peer.wall:6.1f} "
-            f"wall), ratio {peer.cpu / own.cpu:5.2f}, own {2 * work / own.cpu:5.2f} {result[name]['unit']}", flush=True
+            f"wall), ratio {peer.cpu / own.cpu:5.2f}, own {2 * work / own.cpu:5.2f} {result[name]['unit']}",
+            flush=True,
         )
     return result
 
@@ -143,17 +148,22 @@ def accuracy(views: int = 360, n: int = 256) -> Result:
         )
         found = compare(volume.values, grid, objects)
         result[name] = {
-            "centre_mean": float(found.centre_error.mean()), "centre_max": float(found.centre_error.max()),
+            "centre_mean": float(found.centre_error.mean()),
+            "centre_max": float(found.centre_error.max()),
             "centroid_mean": float(found.centroid_error.mean()),
-            "radius_mean": float(found.radius_error.mean()), "radius_sd": float(found.radius_error.std()),
-            "inner": float(found.inner.mean()), "background": found.background, "cpu_s": clock.cpu,
+            "radius_mean": float(found.radius_error.mean()),
+            "radius_sd": float(found.radius_error.std()),
+            "inner": float(found.inner.mean()),
+            "background": found.background,
+            "cpu_s": clock.cpu,
             "view_residual": float(volume.view_residual.mean()),
         }
         print(
             f"{name:12s} centre of fit {found.centre_error.mean():.4f} mean {found.centre_error.max():.4f} max, of "
             f"mass {found.centroid_error.mean():.4f} voxel, radius {found.radius_error.mean():+.4f} +- "
             f"{found.radius_error.std():.4f}, inner {found.inner.mean():.4f}, background {found.background:.4f}, "
-            f"{clock.cpu:.0f} cpu s", flush=True
+            f"{clock.cpu:.0f} cpu s",
+            flush=True,
         )
     return result
 
@@ -170,7 +180,12 @@ def agreement(n: int = 256, views: int = 90) -> Result:
     result = {}
     for order in ("golden", "random"):
         own = reconstruct(
-            images, matrices, grid, images_are="line-integrals", consistency="off", engine="cpu",
+            images,
+            matrices,
+            grid,
+            images_are="line-integrals",
+            consistency="off",
+            engine="cpu",
             **{**PAPER, "order": order},
         ).values
         engine = RtkEngine(matrices, grid)
@@ -240,9 +255,12 @@ def large(views: int = 20) -> Result:
     bytes_volume, bytes_scan = volume.values.nbytes, 4 * 900 * 1024**2
     bytes_here = sum(i.nbytes for i in images)
     result = {
-        "views": views, "cpu_s": clock.cpu, "wall_s": clock.wall,
+        "views": views,
+        "cpu_s": clock.cpu,
+        "wall_s": clock.wall,
         "minutes_900_views_2_idle_cores": clock.cpu / views * 900 / 2 / 60,
-        "peak_GiB": peak / 2**30, "before_GiB": before / 2**30,
+        "peak_GiB": peak / 2**30,
+        "before_GiB": before / 2**30,
         "peak_without_the_images_held_over_volume": (peak - bytes_here) / bytes_volume,
         "peak_with_all_900_views_in_memory_over_volume_and_projections": (peak - bytes_here + bytes_scan)
         / (bytes_volume + bytes_scan),
@@ -252,7 +270,12 @@ def large(views: int = 20) -> Result:
 
 
 PARTS: dict[str, Callable[..., Result]] = {
-    "speed": speed, "accuracy": accuracy, "agreement": agreement, "adjoint": adjoint, "slabs": slabs, "large": large
+    "speed": speed,
+    "accuracy": accuracy,
+    "agreement": agreement,
+    "adjoint": adjoint,
+    "slabs": slabs,
+    "large": large,
 }
 
 

@@ -25,14 +25,20 @@ from tomopose.studies.section6.tables import PERIODS, rms, waves
 from tomopose.volume import Volume
 
 NUMBERS = Numbers(
-    binning={"specimen": 5, "standard": 4}, views={"specimen": 360, "standard": 500},
-    runs={"specimen": (1,), "standard": (1,)}, edge=0.35, samples=2, radiographs=False,
+    binning={"specimen": 5, "standard": 4},
+    views={"specimen": 360, "standard": 500},
+    runs={"specimen": (1,), "standard": (1,)},
+    edge=0.35,
+    samples=2,
+    radiographs=False,
 )
 LATITUDES = ((50, 70), (70, 90), (90, 110), (110, 130))
 """Degrees from the top."""
 PATHS: tuple[Path, ...] = ("circular", "3D")
 METHODS: dict[str, dict[str, Any]] = {
-    "one sweep of SART": PAPER, "FDK, then SART": {}, "FDK along the path": {"algorithm": "fdk"},
+    "one sweep of SART": PAPER,
+    "FDK, then SART": {},
+    "FDK along the path": {"algorithm": "fdk"},
 }
 
 
@@ -64,7 +70,12 @@ def main() -> None:
         for name, options in METHODS.items():
             begin = time.process_time()
             volume = reconstruct(
-                images, scan.truth, grid_of("standard", NUMBERS), white=WHITE, engine="cpu", consistency="off",
+                images,
+                scan.truth,
+                grid_of("standard", NUMBERS),
+                white=WHITE,
+                engine="cpu",
+                consistency="off",
                 **options,
             )
             seconds = time.process_time() - begin
@@ -72,7 +83,8 @@ def main() -> None:
             print(
                 f"{path:8s} {name:18s} distances {rms(m['distance_um']):.2f} um, diameters "
                 f"{np.std(m['diameter_um']):.2f} um, sphericity {np.mean(m['form_um']):.1f} um, seven waves "
-                f"{', '.join(f'{a:.1f}' for a in seven_waves(volume))} um, {seconds:.0f} s", flush=True
+                f"{', '.join(f'{a:.1f}' for a in seven_waves(volume))} um, {seconds:.0f} s",
+                flush=True,
             )
 
 

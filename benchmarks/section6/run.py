@@ -32,7 +32,10 @@ def main() -> None:
     numbers = Numbers(
         binning=dict(zip(section6.THINGS, given.binning, strict=True)),
         views=dict(zip(section6.THINGS, given.views, strict=True)),
-        runs=dict.fromkeys(section6.THINGS, tuple(given.runs)), edge=given.edge, samples=2, radiographs=True,
+        runs=dict.fromkeys(section6.THINGS, tuple(given.runs)),
+        edge=given.edge,
+        samples=2,
+        radiographs=True,
     )
     begin, cpu = time.perf_counter(), time.process_time()
     steps = Steps(folder=given.out / "steps", key={"study": "section6", "seed": given.seed})
@@ -47,9 +50,18 @@ def main() -> None:
     rows, checks, figures, notes = section6.run_with(numbers, given.seed, steps, progress)
     scale = f"{given.binning[0]} x and {given.binning[1]} x binned, {given.views[0]} and {given.views[1]} views"
     result = StudyResult(
-        name="section6", title=section6.TITLE, paper=PAPER["section6"], question=section6.QUESTION, scale=scale,
-        seed=given.seed, rows=tuple(rows), checks=tuple(checks), figures=tuple(figures), notes=tuple(notes),
-        seconds=time.perf_counter() - begin, provenance=provenance(arguments=vars(given), seed=given.seed),
+        name="section6",
+        title=section6.TITLE,
+        paper=PAPER["section6"],
+        question=section6.QUESTION,
+        scale=scale,
+        seed=given.seed,
+        rows=tuple(rows),
+        checks=tuple(checks),
+        figures=tuple(figures),
+        notes=tuple(notes),
+        seconds=time.perf_counter() - begin,
+        provenance=provenance(arguments=vars(given), seed=given.seed),
     )
     write_study(given.out, result, force=True)
     for check in checks:

@@ -81,6 +81,7 @@ def _move(M: Any) -> Mistake:
 
 def _lag(lag: int) -> Mistake:
     """The centre of row k is that of the pose `lag` rows further on."""
+
     def change(f: Files, _: np.random.Generator) -> Files:
         n = len(f.t)
         k = np.arange(max(0, -lag), min(n, n - lag))
@@ -137,8 +138,13 @@ def files(rng: np.random.Generator, *, still: bool) -> Files:
     T_HT = RigidTransform(R=turn.as_matrix(), t=rng.uniform(-5, 5, 3), source=Frame.H, target=Frame.T)
     way = rng.normal(size=3)
     ball = rng.uniform(15, 25) * way / np.linalg.norm(way)
-    x = project_ball(SCANNER, T_HT=T_HT, T_MH=RigidTransform(R=R, t=t, source=Frame.M, target=Frame.H), t=ball,
-                     alpha=np.radians(alpha))
+    x = project_ball(
+        SCANNER,
+        T_HT=T_HT,
+        T_MH=RigidTransform(R=R, t=t, source=Frame.M, target=Frame.H),
+        t=ball,
+        alpha=np.radians(alpha),
+    )
     return Files(t=t, R=R, alpha=alpha, x=x + rng.normal(0, SIGMA_PX, x.shape), row=np.arange(len(t)))
 
 
@@ -158,8 +164,14 @@ def write(folder: Path, f: Files) -> list[str]:
     lines = ["pose_id,u_px,v_px,sigma_u_px,sigma_v_px"]
     lines += [f"p{k:03d},{u:.6f},{v:.6f},{SIGMA_PX},{SIGMA_PX}" for k, (u, v) in zip(f.row, f.x, strict=True)]
     (folder / "observations.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return ["--scanner", str(folder / "scanner.json"), "--poses", str(folder / "poses.csv"), "--observations",
-            str(folder / "observations.csv")]
+    return [
+        "--scanner",
+        str(folder / "scanner.json"),
+        "--poses",
+        str(folder / "poses.csv"),
+        "--observations",
+        str(folder / "observations.csv"),
+    ]
 
 
 def command(words: list[str]) -> tuple[int, dict[str, Any]]:
@@ -193,8 +205,16 @@ def cases(folder: Path, *, still: bool, seed: int = 0) -> list[dict[str, Any]]:
         code, said = command(["diagnose", *options])
         code_c, calibrated = command(["calibrate", *options, "--out", str(folder / "cal"), "--force"])
         verdict, cure = judged(name, said)
-        found.append({"mistake": name, "diagnose": verdict, "cure": cure, "exit": code, "calibrate_exit": code_c,
-                      "calibrate": calibrated.get("verdict", "refused")})
+        found.append(
+            {
+                "mistake": name,
+                "diagnose": verdict,
+                "cure": cure,
+                "exit": code,
+                "calibrate_exit": code_c,
+                "calibrate": calibrated.get("verdict", "refused"),
+            }
+        )
     return found
 
 
@@ -203,12 +223,17 @@ def conventions(folder: Path) -> None:
         rows = cases(folder, still=still)
         good = sum(r["diagnose"].startswith(("first", "refused")) for r in rows)
         blind = sum(r["diagnose"] == "not told apart" for r in rows)
-        print(f"\nWrong conventions written into the files, {plan}: {good} of {len(rows)} named, "
-              f"{blind} said not to be told apart")
+        print(
+            f"\nWrong conventions written into the files, {plan}: {good} of {len(rows)} named, "
+            f"{blind} said not to be told apart"
+        )
         print(f"{'mistake':44s} {'diagnose':24s} {'exit':>4s}  {'calibrate':12s} {'exit':>4s}  cure printed")
         for r in rows:
-            print(f"{r['mistake']:44s} {r['diagnose']:24s} {r['exit']:4d}  {r['calibrate']:12s} "
-                  f"{r['calibrate_exit']:4d}  {r['cure'][:90]}", flush=True)
+            print(
+                f"{r['mistake']:44s} {r['diagnose']:24s} {r['exit']:4d}  {r['calibrate']:12s} "
+                f"{r['calibrate_exit']:4d}  {r['cure'][:90]}",
+                flush=True,
+            )
 
 
 def main() -> None:

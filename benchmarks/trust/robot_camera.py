@@ -51,9 +51,9 @@ def undistorted(uv: Any, K: Any, k: Any) -> np.ndarray:
     x = seen.copy()
     for _ in range(UNDISTORTIONS):
         r2, xy = (x**2).sum(-1, keepdims=True), x[..., :1] * x[..., 1:]
-        tangential = np.concatenate([
-            2 * p1 * xy + p2 * (r2 + 2 * x[..., :1] ** 2), p1 * (r2 + 2 * x[..., 1:] ** 2) + 2 * p2 * xy
-        ], axis=-1)
+        tangential = np.concatenate(
+            [2 * p1 * xy + p2 * (r2 + 2 * x[..., :1] ** 2), p1 * (r2 + 2 * x[..., 1:] ** 2) + 2 * p2 * xy], axis=-1
+        )
         x = (seen - tangential) / (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3)
     return x * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
 
@@ -73,14 +73,18 @@ def corner_problems(folder: Path, corners: Any) -> list[Problem]:
     K, (n_u, n_v) = np.array(data["K"]), data["image_size_wh"]
     # u of D runs against x_S, v along y_S: image columns are mirrored, rows (which run down) are not
     camera = Scanner(
-        d_SD=D_SD_MM, d_SR=500.0, p_u=D_SD_MM / K[0, 0], p_v=D_SD_MM / K[1, 1], u_0=n_u - 1 - K[0, 2], v_0=K[1, 2],
-        n_u=n_u, n_v=n_v,
+        d_SD=D_SD_MM,
+        d_SR=500.0,
+        p_u=D_SD_MM / K[0, 0],
+        p_v=D_SD_MM / K[1, 1],
+        u_0=n_u - 1 - K[0, 2],
+        v_0=K[1, 2],
+        n_u=n_u,
+        n_v=n_v,
     )
     uv = undistorted(np.array([data["corners_px"][n] for n in names]), K, data["dist_k1k2p1p2k3"])
     x = np.stack([n_u - 1 - uv[..., 0], uv[..., 1]], axis=-1)
-    return [
-        pair(camera, poses, BallObservations.from_sigma(x[:, c], CORNER_SIGMA_PX, pose_id=names)) for c in corners
-    ]
+    return [pair(camera, poses, BallObservations.from_sigma(x[:, c], CORNER_SIGMA_PX, pose_id=names)) for c in corners]
 
 
 def _normalised(d: np.ndarray, C: np.ndarray) -> np.ndarray:
@@ -129,8 +133,10 @@ def normalised_spread(fits: list[Fit], covariances: list[np.ndarray]) -> Spread:
         centre = exp_rotation(np.median(log_rotation(R @ centre.T), axis=0)) @ centre
     e = np.concatenate([log_rotation(R @ centre.T), t - np.median(t, axis=0)], axis=1)
     return Spread(
-        rotation=birge_ratio(R, t, C, 3), mount=birge_ratio(R, t, C, 6),
-        median_rotation=_median_ratio(e[:, :3], C[:, :3, :3]), median_mount=_median_ratio(e, C[:, :6, :6]),
+        rotation=birge_ratio(R, t, C, 3),
+        mount=birge_ratio(R, t, C, 6),
+        median_rotation=_median_ratio(e[:, :3], C[:, :3, :3]),
+        median_mount=_median_ratio(e, C[:, :6, :6]),
     )
 
 
@@ -141,7 +147,9 @@ def together(problems: list[Problem]) -> Problem:
         for name in ("R_MH", "t_MH", "alpha", "run", "index", "x_D", "covariance", "W")
     }
     return replace(
-        problems[0], **rows, ball=np.repeat(np.arange(len(problems)), [len(p) for p in problems]),
+        problems[0],
+        **rows,
+        ball=np.repeat(np.arange(len(problems)), [len(p) for p in problems]),
         ball_ids=tuple(range(len(problems))),
         pose_id=tuple(f"{i}/{c}" for c, p in enumerate(problems) for i in p.pose_id),
     )
@@ -167,11 +175,17 @@ def by_chance(problems: list[Problem], free: Any, fits: list[Fit], field: PoseFi
     spreads = []
     for _ in range(draws):
         e_t, e_w = (root @ rng.standard_normal((n, 3)) for root in roots)
-        e = np.array([
-            A @ (np.einsum("kij,kj->ki", G, e_t) + np.einsum("kij,kj->ki", L, e_w)
-                 + rng.normal(0, CORNER_SIGMA_PX, (n, 2))).ravel()
-            for G, L, A in parts
-        ])
+        e = np.array(
+            [
+                A
+                @ (
+                    np.einsum("kij,kj->ki", G, e_t)
+                    + np.einsum("kij,kj->ki", L, e_w)
+                    + rng.normal(0, CORNER_SIGMA_PX, (n, 2))
+                ).ravel()
+                for G, L, A in parts
+            ]
+        )
         row = []
         for c, W in weights.items():
             mean = np.linalg.solve(W.sum(axis=0), np.einsum("nij,nj->i", W, e[:, :c]))
@@ -188,8 +202,10 @@ def study(folder: Path, corners: Any = range(408), *, joined: int = TOGETHER, ch
     fits = [best_fit(p, free) for p in problems]
     dof = 2 * len(problems[0]) - 9
     plain = [inverse_information(f.N) * f.chi2 / dof for f in fits]
-    residual = [float(np.sqrt(((p.x_D - blocks(p, free, f).x_D) ** 2).sum(axis=1).mean()))
-                for p, f in zip(problems, fits, strict=True)]
+    residual = [
+        float(np.sqrt(((p.x_D - blocks(p, free, f).x_D) ** 2).sum(axis=1).mean()))
+        for p, f in zip(problems, fits, strict=True)
+    ]
     run = together([problems[int(k)] for k in (np.arange(joined) + 0.5) * len(problems) / joined])
     field = estimate_pose_field([run], free, [best_fit(run, free)], length=None, angle=None, base="M")
     found = [solve_with_field(p, free, f, field) for p, f in zip(problems, fits, strict=True)]

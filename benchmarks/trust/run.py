@@ -58,8 +58,15 @@ def mixed(n: int, *, seed: int = 1, alphas: tuple[float, ...] = TURNS, tilt_deg:
     )
 
 
-def observe(poses: PoseSequence, *, T_HT: RigidTransform = MOUNT, t: np.ndarray = BALL, scanner: Scanner = SCANNER,
-            sigma: float = SIGMA_PX, seed: int | None = 0) -> BallObservations:
+def observe(
+    poses: PoseSequence,
+    *,
+    T_HT: RigidTransform = MOUNT,
+    t: np.ndarray = BALL,
+    scanner: Scanner = SCANNER,
+    sigma: float = SIGMA_PX,
+    seed: int | None = 0,
+) -> BallObservations:
     x = project_ball(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=t, alpha=poses.alpha)
     if seed is not None:
         x = x + np.random.default_rng(seed).normal(0, sigma, x.shape)
@@ -68,11 +75,15 @@ def observe(poses: PoseSequence, *, T_HT: RigidTransform = MOUNT, t: np.ndarray 
 
 def convergence(runs: int) -> None:
     print(f"\nConvergence from no start value, {runs} random mounts a plan (any rotation; t_HT +-10 mm, t +-20 mm)")
-    print(f"{'plan':34s} {'reached':>8s} {'wrong, and said':>16s} {'wrong, unsaid':>14s} "
-          f"{'CPU ms, median':>15s} {'99 %':>6s}")
+    print(
+        f"{'plan':34s} {'reached':>8s} {'wrong, and said':>16s} {'wrong, unsaid':>14s} "
+        f"{'CPU ms, median':>15s} {'99 %':>6s}"
+    )
     plans = {
-        "paper grid, 189": pose_grid(3), "paper grid, 56": pose_grid(2),
-        "random, table still, 60": mixed(60, alphas=(0.0,)), "random, four table angles, 60": mixed(60),
+        "paper grid, 189": pose_grid(3),
+        "paper grid, 56": pose_grid(2),
+        "random, table still, 60": mixed(60, alphas=(0.0,)),
+        "random, four table angles, 60": mixed(60),
         "random, any rotation, 40": mixed(40, alphas=(0.0,), tilt_deg=180.0),
     }
     for name, poses in plans.items():
@@ -80,8 +91,12 @@ def convergence(runs: int) -> None:
         reached = said = unsaid = 0
         times = []
         for _ in range(runs):
-            T_HT = RigidTransform(R=Rotation.random(random_state=rng).as_matrix(), t=rng.uniform(-10, 10, 3),
-                                  source=Frame.H, target=Frame.T)
+            T_HT = RigidTransform(
+                R=Rotation.random(random_state=rng).as_matrix(),
+                t=rng.uniform(-10, 10, 3),
+                source=Frame.H,
+                target=Frame.T,
+            )
             x = project_ball(SCANNER, T_HT=T_HT, T_MH=poses.T_MH, t=rng.uniform(-20, 20, 3), alpha=poses.alpha)
             x = x + rng.normal(0, SIGMA_PX, x.shape)
             problem = pair(SCANNER, poses, BallObservations.from_sigma(x, SIGMA_PX, pose_id=poses.pose_id))
@@ -94,13 +109,17 @@ def convergence(runs: int) -> None:
             poor = not fit.converged or fit.chi2 / (2 * len(problem) - 9) > 4
             said += not near and poor
             unsaid += not near and not poor
-        print(f"{name:34s} {reached:8d} {said:16d} {unsaid:14d} {1e3 * np.median(times):15.2f} "
-              f"{1e3 * np.quantile(times, 0.99):6.2f}", flush=True)
+        print(
+            f"{name:34s} {reached:8d} {said:16d} {unsaid:14d} {1e3 * np.median(times):15.2f} "
+            f"{1e3 * np.quantile(times, 0.99):6.2f}",
+            flush=True,
+        )
 
 
 def _truth(free: object, n: int) -> Fit:
-    return Fit(R_HT=MOUNT.R, t_HT=MOUNT.t, t=BALL[None], delta=np.zeros(n), chi2=0.0, converged=True,
-               N=np.zeros((0, 0)))
+    return Fit(
+        R_HT=MOUNT.R, t_HT=MOUNT.t, t=BALL[None], delta=np.zeros(n), chi2=0.0, converged=True, N=np.zeros((0, 0))
+    )
 
 
 def coverage(runs: int) -> None:
@@ -110,7 +129,10 @@ def coverage(runs: int) -> None:
         "paper grid, 56": (pose_grid(2), {}, None),
         "compound, four table angles, 40": (mixed(40), {}, None),
         "the same, d_SR u_0 eta pitch with priors": (
-            mixed(40), {"d_SR": 0.05, "u_0": 0.5, "eta": 1e-3, "pitch_ratio": 1e-3}, None),
+            mixed(40),
+            {"d_SR": 0.05, "u_0": 0.5, "eta": 1e-3, "pitch_ratio": 1e-3},
+            None,
+        ),
         "the same, pose noise 0.5 um, 12 urad": (mixed(40), {}, PoseNoise(translation=5e-4, rotation=12e-6)),
         "the same, pose noise 5 um, 0.1 mrad": (mixed(40), {}, PoseNoise(translation=5e-3, rotation=1e-4)),
     }
@@ -121,8 +143,11 @@ def coverage(runs: int) -> None:
         free = free_parameters((SCANNER,), priors=priors)
         truth = _truth(free, len(free))
         mc = draw(problem, free, truth, runs, seed=3, noise=noise)
-        weighted = problem if noise is None else problem.with_covariance(
-            total_covariance(problem.covariance, blocks(problem, free, truth), noise))
+        weighted = (
+            problem
+            if noise is None
+            else problem.with_covariance(total_covariance(problem.covariance, blocks(problem, free, truth), noise))
+        )
         C = inverse_information(minimise(weighted, free, truth).N)
         q = np.einsum("bi,ij,bj->b", mc.errors, np.linalg.inv(C), mc.errors)
         each = np.abs(mc.errors) < 1.96 * np.sqrt(np.diag(C))
@@ -134,8 +159,11 @@ def coverage(runs: int) -> None:
         lengths = _length_errors(cal, scan, x, mc.errors)
         inside = np.abs(lengths) < 1.96 * length_sigma(cal, scan, x[:1], x[1:])[0]
         ratio = mc.u / np.sqrt(np.diag(C))
-        print(f"{name:44s} {(q < chdtri(len(C), 0.05)).mean():14.3f} {each.mean():7.3f} {pixels.mean():7.3f} "
-              f"{inside.mean():8.3f} {ratio.min():8.3f}-{ratio.max():.3f}", flush=True)
+        print(
+            f"{name:44s} {(q < chdtri(len(C), 0.05)).mean():14.3f} {each.mean():7.3f} {pixels.mean():7.3f} "
+            f"{inside.mean():8.3f} {ratio.min():8.3f}-{ratio.max():.3f}",
+            flush=True,
+        )
 
 
 def _length_errors(cal: object, scan: PoseSequence, x: np.ndarray, errors: np.ndarray) -> np.ndarray:
@@ -147,13 +175,16 @@ def _length_errors(cal: object, scan: PoseSequence, x: np.ndarray, errors: np.nd
 
 
 def rivals() -> None:
-    print("\nResidual d_rms (px) that each mistake leaves, by plan (M 2.7, noise 0.0207 px)  "
-          "[same: cannot be told apart]")
+    print(
+        "\nResidual d_rms (px) that each mistake leaves, by plan (M 2.7, noise 0.0207 px)  [same: cannot be told apart]"
+    )
     plans = {
-        "paper 189, ball 20 mm off": (pose_grid(3), BALL), "paper 189, ball 1 mm off": (pose_grid(3), NEAR),
+        "paper 189, ball 20 mm off": (pose_grid(3), BALL),
+        "paper 189, ball 1 mm off": (pose_grid(3), NEAR),
         "compound 56, four table angles": (mixed(56), BALL),
         "optimal, table 0 and 90": (
-            plan_poses(FAR, T_HT=MOUNT, t=BALL, limits=PlanLimits(table_angles=TURNS[:2])).poses, BALL,
+            plan_poses(FAR, T_HT=MOUNT, t=BALL, limits=PlanLimits(table_angles=TURNS[:2])).poses,
+            BALL,
         ),
     }
     columns: dict[str, dict[str, str]] = {}
@@ -174,12 +205,15 @@ def rivals() -> None:
 def _scanner_mistakes(poses: PoseSequence, t: np.ndarray) -> dict[str, str]:
     """What wrong values of the scanner leave."""
     wrong = {
-        "u_0 + 1 px": {"u_0": FAR.u_0 + 1}, "u_0 + 20 px": {"u_0": FAR.u_0 + 20},
-        "d_SR + 1 %": {"d_SR": 1.01 * FAR.d_SR}, "d_SR + 0.05 %": {"d_SR": 1.0005 * FAR.d_SR},
+        "u_0 + 1 px": {"u_0": FAR.u_0 + 1},
+        "u_0 + 20 px": {"u_0": FAR.u_0 + 20},
+        "d_SR + 1 %": {"d_SR": 1.01 * FAR.d_SR},
+        "d_SR + 0.05 %": {"d_SR": 1.0005 * FAR.d_SR},
         "d_SD + 1 %": {"d_SD": 1.01 * FAR.d_SD},
         "both pitches + 0.5 %": {"p_u": 1.005 * FAR.p_u, "p_v": 1.005 * FAR.p_v},
         "pitch p_u alone + 0.5 %": {"p_u": 1.005 * FAR.p_u},
-        "detector roll 0.5 deg": {"eta": np.radians(0.5)}, "detector roll 0.05 deg": {"eta": np.radians(0.05)},
+        "detector roll 0.5 deg": {"eta": np.radians(0.5)},
+        "detector roll 0.05 deg": {"eta": np.radians(0.05)},
         "detector tilt 0.5 deg": {"theta": np.radians(0.5)},
     }
     cells = {}
@@ -199,8 +233,10 @@ def _left(problem: Problem) -> str:
 
 
 def images_needed() -> None:
-    print("\nImages and predicted scan reprojection error (px rms; tilted scan of eq. (11), +-15, +-15, +-30 mm, "
-          "object's pose removed)")
+    print(
+        "\nImages and predicted scan reprojection error (px rms; tilted scan of eq. (11), +-15, +-15, +-30 mm, "
+        "object's pose removed)"
+    )
     target = scan_target(SCANNER, T_HT=nominal_mount())
     print(f"{'plan':34s} {'images':>7s} {'px':>8s} {'rivals not told apart':s}")
     for n in (2, 3, 4, 5):
@@ -217,8 +253,10 @@ def images_needed() -> None:
             plan = plan_poses(SCANNER, t=BALL, n=n, limits=PlanLimits(table_angles=alphas))
             assert plan.resolved is not None
             told = ", ".join(h.name for h in plan.resolved.unresolved) or "the true symmetries only"
-            print(f"{words:34s} {len(plan):7d} {plan.predicted:8.5f} {told} [{time.process_time() - begin:.1f} s CPU]",
-                  flush=True)
+            print(
+                f"{words:34s} {len(plan):7d} {plan.predicted:8.5f} {told} [{time.process_time() - begin:.1f} s CPU]",
+                flush=True,
+            )
 
 
 def _change(a: Fit, b: Fit) -> float:
@@ -231,11 +269,14 @@ def outliers(runs: int) -> None:
     """Against the clean data, and against the fit that is told which centres are bad: the first cannot be better than
     what the lost centres would have said, the second is what the search adds."""
     print(f"\nOutliers in 8 % of the centres, {runs} runs; changes in standard uncertainties, largest coordinate")
-    print(f"{'plan, size of the errors':44s} {'found':>12s} {'others':>7s} {'change from clean':>18s} "
-          f"{'the same, told':>15s} {'from told':>10s}  (each: median, largest)")
+    print(
+        f"{'plan, size of the errors':44s} {'found':>12s} {'others':>7s} {'change from clean':>18s} "
+        f"{'the same, told':>15s} {'from told':>10s}  (each: median, largest)"
+    )
     free = free_parameters((SCANNER,))
     for name, poses, low, high in (
-        ("paper grid, 189, to 30 px", pose_grid(3), 0.0, 30.0), ("compound, 60, to 30 px", mixed(60), 0.0, 30.0),
+        ("paper grid, 189, to 30 px", pose_grid(3), 0.0, 30.0),
+        ("compound, 60, to 30 px", mixed(60), 0.0, 30.0),
         ("paper grid, 189, 0.05 to 0.5 px", pose_grid(3), 0.05, 0.5),
     ):
         n = len(poses)
@@ -284,8 +325,11 @@ def one_outlier(runs: int) -> None:
                 found += not robust.keep[k]
                 worst = max(worst, _change(robust.fit, told))
             cells.append(f"{size} sigma {100 * found / runs:.0f} % {worst:.1f}")
-        print(f"one bad image, {name}, leverage {leverage[k, 1]:.2f}: found, largest change from the fit without it: "
-              + "; ".join(cells), flush=True)
+        print(
+            f"one bad image, {name}, leverage {leverage[k, 1]:.2f}: found, largest change from the fit without it: "
+            + "; ".join(cells),
+            flush=True,
+        )
 
 
 def speed(draws: int) -> None:
@@ -295,8 +339,10 @@ def speed(draws: int) -> None:
     wall, cpu = time.perf_counter(), time.process_time()
     draw(problem, free, _truth(free, 0), draws, seed=1)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    print(f"\nMonte Carlo: {draws} solves of 189 poses in {wall:.1f} s ({cpu:.1f} s CPU): {1e5 / draws * cpu / 2:.1f} "
-          "s for 100,000 on two free cores")
+    print(
+        f"\nMonte Carlo: {draws} solves of 189 poses in {wall:.1f} s ({cpu:.1f} s CPU): {1e5 / draws * cpu / 2:.1f} "
+        "s for 100,000 on two free cores"
+    )
     poses_, observed = pose_grid(3), observe(pose_grid(3))
     for words, options in (("calibrate, alone", {"hypotheses": False}), ("calibrate with quick rivals", {})):
         times = []
@@ -314,22 +360,29 @@ def robot(shared: Path) -> None:
         return
     r = study(folder)
     low, middle, high = r["chance"]
-    print(f"\nReal robot with a camera, {r['corners']} corners, each alone (residual {r['residual_px']:.2f} px): "
-          "spread of the mounts over the stated uncertainty, Birge ratio (of medians)")
+    print(
+        f"\nReal robot with a camera, {r['corners']} corners, each alone (residual {r['residual_px']:.2f} px): "
+        "spread of the mounts over the stated uncertainty, Birge ratio (of medians)"
+    )
     print(f"{'uncertainty from':44s} {'rotation':>15s} {'all six':>15s}")
     for words, s in (("J^T J, scaled to the residuals", r["plain"]), ("the robot's errors modelled", r["modelled"])):
         print(f"{words:44s} {s.rotation:7.2f} ({s.median_rotation:5.2f}) {s.mount:7.2f} ({s.median_mount:5.2f})")
-    print("Birge ratio by chance, were the model true: "
-          f"rotation {low[0]:.2f} to {high[0]:.2f} (median {middle[0]:.2f}), "
-          f"all six {low[1]:.2f} to {high[1]:.2f} (median {middle[1]:.2f})")
+    print(
+        "Birge ratio by chance, were the model true: "
+        f"rotation {low[0]:.2f} to {high[0]:.2f} (median {middle[0]:.2f}), "
+        f"all six {low[1]:.2f} to {high[1]:.2f} (median {middle[1]:.2f})"
+    )
     print(f"the robot's errors: {described(r['field'])}")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--small", action="store_true", help="a tenth of the runs")
-    parser.add_argument("--shared", type=Path, default=Path(os.environ.get(
-        "TOMOPOSE_SHARED", Path(__file__).resolve().parents[3] / "shared")))
+    parser.add_argument(
+        "--shared",
+        type=Path,
+        default=Path(os.environ.get("TOMOPOSE_SHARED", Path(__file__).resolve().parents[3] / "shared")),
+    )
     options = parser.parse_args()
     part = 10 if options.small else 1
     convergence(10_000 // part)

@@ -1,6 +1,6 @@
 """Draws docs/images/demo.png from the folder that `tomopose demo` made.
 
-    tomopose demo --out demo && python docs/images/make_demo_picture.py demo
+tomopose demo --out demo && python docs/images/make_demo_picture.py demo
 """
 
 from __future__ import annotations

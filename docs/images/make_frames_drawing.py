@@ -1,6 +1,6 @@
 """Draws docs/images/frames.svg and detector.svg.  Axes come from the package's own transforms; distances are shortened.
 
-    python docs/images/make_frames_drawing.py
+python docs/images/make_frames_drawing.py
 """
 
 from __future__ import annotations
@@ -22,9 +22,7 @@ MIDDLE = np.array([405.0, 235.0])
 
 # Seen from +y, a little from the source's side and from above: the source stands left, the detector right.
 AZIMUTH, ELEVATION = np.radians(64.0), np.radians(17.0)
-TOWARDS_EYE = np.array(
-    [np.cos(AZIMUTH) * np.cos(ELEVATION), np.sin(AZIMUTH) * np.cos(ELEVATION), np.sin(ELEVATION)]
-)
+TOWARDS_EYE = np.array([np.cos(AZIMUTH) * np.cos(ELEVATION), np.sin(AZIMUTH) * np.cos(ELEVATION), np.sin(ELEVATION)])
 RIGHT = np.cross([0.0, 0.0, 1.0], TOWARDS_EYE) / np.cos(ELEVATION)
 UP = np.cross(TOWARDS_EYE, RIGHT)
 
@@ -35,19 +33,37 @@ def place(x: object) -> np.ndarray:
     return MIDDLE + SCALE * np.stack([x @ RIGHT, -(x @ UP)], axis=-1)
 
 
-def path(points: object, *, colour: str = SOFT, width: float = 1.4, fill: str = "none", dash: str = "",
-         closed: bool = False, arrow: str = "") -> str:
+def path(
+    points: object,
+    *,
+    colour: str = SOFT,
+    width: float = 1.4,
+    fill: str = "none",
+    dash: str = "",
+    closed: bool = False,
+    arrow: str = "",
+) -> str:
     ends = "L".join(f"{a:.1f},{b:.1f}" for a, b in place(points))
     extra = f' stroke-dasharray="{dash}"' if dash else ""
     extra += f' marker-end="url(#{arrow})"' if arrow else ""
     return f'<path d="M{ends}{"Z" if closed else ""}" stroke="{colour}" stroke-width="{width}" fill="{fill}"{extra}/>'
 
 
-def text(words: str, at: object, *, shift: tuple[float, float] = (0, 0), colour: str = INK, size: float = 15,
-         anchor: str = "start", weight: str = "400") -> str:
+def text(
+    words: str,
+    at: object,
+    *,
+    shift: tuple[float, float] = (0, 0),
+    colour: str = INK,
+    size: float = 15,
+    anchor: str = "start",
+    weight: str = "400",
+) -> str:
     a, b = place(at) + np.asarray(shift)
-    return (f'<text x="{a:.1f}" y="{b:.1f}" fill="{colour}" font-size="{size}" text-anchor="{anchor}" '
-            f'font-weight="{weight}" {FONT}>{words}</text>')
+    return (
+        f'<text x="{a:.1f}" y="{b:.1f}" fill="{colour}" font-size="{size}" text-anchor="{anchor}" '
+        f'font-weight="{weight}" {FONT}>{words}</text>'
+    )
 
 
 def triad(frame: RigidTransform, name: str, *, length: float = 1.05, label: tuple[float, float] = (-10, 20)) -> str:
@@ -98,8 +114,12 @@ def frames_drawing() -> str:
         parts.append(path([foot, head], colour="#9aa6b3", width=4))
     plate = np.linspace(0, 2 * np.pi, 60)
     parts += [
-        path(M.apply(np.c_[0.95 * np.cos(plate), 0.95 * np.sin(plate), np.full_like(plate, -0.45)]), colour=SOFT,
-             fill="#eef2f6", closed=True),
+        path(
+            M.apply(np.c_[0.95 * np.cos(plate), 0.95 * np.sin(plate), np.full_like(plate, -0.45)]),
+            colour=SOFT,
+            fill="#eef2f6",
+            closed=True,
+        ),
         triad(world, "W", length=1.45, label=(-8, 24)),
         triad(table, "T", length=0.95, label=(22, 40)),
         triad(H, "H", length=0.85, label=(-28, 12)),
@@ -116,8 +136,14 @@ def frames_drawing() -> str:
         text("u", corner[0] + 1.75 * (corner[1] - corner[0]) / 4.9, shift=(-3, 14), colour=AXES[0]),
         text("v", corner[0] + 1.75 * (corner[3] - corner[0]) / 3.9, shift=(8, 4), colour=AXES[1]),
         text("D", corner[0], shift=(-8, 24), size=19, weight="700"),
-        text("(u<tspan dy='3' font-size='10'>0</tspan><tspan dy='-3'>, v</tspan><tspan dy='3' font-size='10'>0</tspan>"
-             "<tspan dy='-3'>)</tspan>", [-7.8, 0, 0], shift=(6, 18), colour=SOFT, size=13),
+        text(
+            "(u<tspan dy='3' font-size='10'>0</tspan><tspan dy='-3'>, v</tspan><tspan dy='3' font-size='10'>0</tspan>"
+            "<tspan dy='-3'>)</tspan>",
+            [-7.8, 0, 0],
+            shift=(6, 18),
+            colour=SOFT,
+            size=13,
+        ),
         text("X-ray spot", source, shift=(-30, 46), colour=SOFT, size=13),
     ]
     for far, below, words in ((0.0, -3.7, "SR"), (-7.8, -4.4, "SD")):
@@ -137,10 +163,11 @@ def svg(parts: list[str], title: str, *, left: int = 0, top: int = 0, width: int
         f'orient="auto-start-reverse"><path d="M0,0.6L10,5L0,9.4Z" fill="{colour}"/></marker>'
         for name, colour in (("head0", AXES[0]), ("head1", AXES[1]), ("head2", AXES[2]), ("headS", SOFT))
     )
-    return (f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{left} {top} {width} {height}" role="img">'
-            f'<title>{title}</title><defs>{heads}</defs>'
-            f'<rect x="{left}" y="{top}" width="{width}" height="{height}" fill="#ffffff"/>'
-            + "\n".join(parts) + "</svg>\n")
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{left} {top} {width} {height}" role="img">'
+        f"<title>{title}</title><defs>{heads}</defs>"
+        f'<rect x="{left}" y="{top}" width="{width}" height="{height}" fill="#ffffff"/>' + "\n".join(parts) + "</svg>\n"
+    )
 
 
 def detector_drawing() -> str:
@@ -148,13 +175,18 @@ def detector_drawing() -> str:
     n_u, n_v, cell = 6, 4, 46.0
     parts = []
 
-    def words(x: float, y: float, what: str, colour: str = INK, size: float = 14, weight: str = "400",
-              anchor: str = "middle") -> None:
-        parts.append(f'<text x="{x}" y="{y}" fill="{colour}" font-size="{size}" text-anchor="{anchor}" '
-                     f'font-weight="{weight}" {FONT}>{what}</text>')
+    def words(
+        x: float, y: float, what: str, colour: str = INK, size: float = 14, weight: str = "400", anchor: str = "middle"
+    ) -> None:
+        parts.append(
+            f'<text x="{x}" y="{y}" fill="{colour}" font-size="{size}" text-anchor="{anchor}" '
+            f'font-weight="{weight}" {FONT}>{what}</text>'
+        )
 
-    for left, title, top_first in ((70.0, "frame D, seen from the source", False),
-                                   (530.0, "image file (TIFF), rows top-first", True)):
+    for left, title, top_first in (
+        (70.0, "frame D, seen from the source", False),
+        (530.0, "image file (TIFF), rows top-first", True),
+    ):
         words(left + n_u * cell / 2, 30, title, weight="700", size=15)
         for v in range(n_v):
             for u in range(n_u):
@@ -167,16 +199,20 @@ def detector_drawing() -> str:
         bottom = 50 + n_v * cell
         x0, y0 = left + cell / 2, bottom - cell / 2
         if top_first:
-            parts.append(f'<path d="M{left - 16},54V{bottom - 6}" stroke="{AXES[1]}" stroke-width="2.4" '
-                         'marker-end="url(#head1)"/>')
+            parts.append(
+                f'<path d="M{left - 16},54V{bottom - 6}" stroke="{AXES[1]}" stroke-width="2.4" '
+                'marker-end="url(#head1)"/>'
+            )
             words(left - 30, 54 + n_v * cell / 2, "row r", AXES[1], anchor="end")
             words(left + n_u * cell / 2, bottom + 26, "numbers are r, column; v = n_v − 1 − r, u = column", SOFT, 13)
         else:
-            parts.append(f'<path d="M{x0},{y0}H{x0 + 1.9 * cell}" stroke="{AXES[0]}" stroke-width="2.4" '
-                         'marker-end="url(#head0)"/>'
-                         f'<path d="M{x0},{y0}V{y0 - 1.9 * cell}" stroke="{AXES[1]}" stroke-width="2.4" '
-                         'marker-end="url(#head1)"/>'
-                         f'<circle cx="{x0}" cy="{y0}" r="3.5" fill="{INK}"/>')
+            parts.append(
+                f'<path d="M{x0},{y0}H{x0 + 1.9 * cell}" stroke="{AXES[0]}" stroke-width="2.4" '
+                'marker-end="url(#head0)"/>'
+                f'<path d="M{x0},{y0}V{y0 - 1.9 * cell}" stroke="{AXES[1]}" stroke-width="2.4" '
+                'marker-end="url(#head1)"/>'
+                f'<circle cx="{x0}" cy="{y0}" r="3.5" fill="{INK}"/>'
+            )
             words(x0 + 2.1 * cell, y0 - 4, "u", AXES[0])
             words(x0 + 11, y0 - 1.85 * cell, "v", AXES[1])
             words(left + n_u * cell / 2, bottom + 26, "numbers are u, v; (0, 0) is the centre of a pixel", SOFT, 13)

@@ -1,6 +1,6 @@
 """Runs the studies at small scale and keeps their pictures for docs/gallery.md in docs/images/gallery.
 
-    python docs/images/make_gallery.py [STUDY ...]
+python docs/images/make_gallery.py [STUDY ...]
 """
 
 from __future__ import annotations
@@ -13,8 +13,14 @@ from tomopose.studies.registry import run_study
 
 FOLDER = Path(__file__).parent / "gallery"
 KEPT = {
-    "table1": (1,), "table2": (1,), "figure8": (1, 2, 3), "figure9": (1,), "tuy": (1, 6, 7), "cylinder": (1,),
-    "section6": (2, 3, 4, 5, 6, 7, 8), "improvements": (1,),
+    "table1": (1,),
+    "table2": (1,),
+    "figure8": (1, 2, 3),
+    "figure9": (1,),
+    "tuy": (1, 6, 7),
+    "cylinder": (1,),
+    "section6": (2, 3, 4, 5, 6, 7, 8),
+    "improvements": (1,),
 }
 """Study -> numbers of its figures."""
 

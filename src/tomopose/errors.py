@@ -1,28 +1,28 @@
 """The error tree.  Every message says what was found, the measured value, and what to do.
 
-    TomoposeError
-    ├ InputError(ValueError)        a value, table or file content that cannot be used
-    │   ├ ShapeError                an array of the wrong shape
-    │   ├ UnitError                 a unit missing, or a magnitude that belongs to another unit
-    │   ├ FrameMismatchError        two transforms that do not chain (source, target)
-    │   └ ConventionError           an unknown or contradictory convention
-    ├ DetectionError                one image (index)
-    │   ├ BallNotFoundError
-    │   ├ BallTruncatedError
-    │   └ AmbiguousBallError
-    ├ CalibrationError              carries the calibration as far as it came
-    │   ├ NotObservableError        (direction, singular_values)
-    │   └ NotConvergedError
-    ├ TrajectoryError               (indices) of the views concerned
-    │   ├ OutOfReachError           (limits)
-    │   └ OutOfViewError
-    ├ EngineError
-    │   ├ EngineMissingError        (install_line)
-    │   └ EngineFailedError
-    ├ ExportError
-    │   └ NotRepresentableError     (format, indices)
-    └ FileError                     (path)
-        └ SchemaVersionError
+TomoposeError
+├ InputError(ValueError)        a value, table or file content that cannot be used
+│   ├ ShapeError                an array of the wrong shape
+│   ├ UnitError                 a unit missing, or a magnitude that belongs to another unit
+│   ├ FrameMismatchError        two transforms that do not chain (source, target)
+│   └ ConventionError           an unknown or contradictory convention
+├ DetectionError                one image (index)
+│   ├ BallNotFoundError
+│   ├ BallTruncatedError
+│   └ AmbiguousBallError
+├ CalibrationError              carries the calibration as far as it came
+│   ├ NotObservableError        (direction, singular_values)
+│   └ NotConvergedError
+├ TrajectoryError               (indices) of the views concerned
+│   ├ OutOfReachError           (limits)
+│   └ OutOfViewError
+├ EngineError
+│   ├ EngineMissingError        (install_line)
+│   └ EngineFailedError
+├ ExportError
+│   └ NotRepresentableError     (format, indices)
+└ FileError                     (path)
+    └ SchemaVersionError
 """
 
 from __future__ import annotations

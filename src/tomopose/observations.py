@@ -61,8 +61,10 @@ class BallObservations:
         if bad.size:
             raise InputError(f"observation of pose {ids[bad[0]]!r} counts as seen but is not a finite number")
         variance = np.einsum("nii->ni", covariance)
-        bad = np.flatnonzero(seen & ((variance <= 0).any(axis=1) | (np.linalg.det(np.where(
-            seen[:, None, None], covariance, np.eye(2))) <= 0)))
+        bad = np.flatnonzero(
+            seen
+            & ((variance <= 0).any(axis=1) | (np.linalg.det(np.where(seen[:, None, None], covariance, np.eye(2))) <= 0))
+        )
         if bad.size:
             raise InputError(f"observation of pose {ids[bad[0]]!r}: its covariance is not positive definite")
         seen.setflags(write=False)

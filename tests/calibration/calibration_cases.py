@@ -28,8 +28,9 @@ def paper_poses(n: int = 3, **columns: object) -> PoseSequence:
     )
 
 
-def mixed_poses(seed: int = 1, n: int = 60, alphas: tuple[float, ...] = (0, 90, 180, 270), **columns: object
-                ) -> PoseSequence:
+def mixed_poses(
+    seed: int = 1, n: int = 60, alphas: tuple[float, ...] = (0, 90, 180, 270), **columns: object
+) -> PoseSequence:
     """Compound rotations and table angles."""
     rng = np.random.default_rng(seed)
     return PoseSequence.from_table(
@@ -37,8 +38,15 @@ def mixed_poses(seed: int = 1, n: int = 60, alphas: tuple[float, ...] = (0, 90, 
     )
 
 
-def observe(poses: PoseSequence, *, scanner: Scanner = SCANNER, T_HT: RigidTransform = MOUNT, t: object = BALL,
-            sigma: float = SIGMA, seed: int | None = 5) -> BallObservations:
+def observe(
+    poses: PoseSequence,
+    *,
+    scanner: Scanner = SCANNER,
+    T_HT: RigidTransform = MOUNT,
+    t: object = BALL,
+    sigma: float = SIGMA,
+    seed: int | None = 5,
+) -> BallObservations:
     """Centres with white noise; exact where the seed is None."""
     x = project_ball(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=t, alpha=poses.alpha)
     if seed is not None:

@@ -102,8 +102,11 @@ def test_a_single_bumped_run_is_flagged_among_few_and_many(n, bump, u):
 @pytest.mark.parametrize(("n", "alarms"), [(6, 0.02), (20, 0.008)])
 def test_quiet_runs_stay_inside(n, alarms):
     rng = np.random.default_rng(0)
-    out = [control_chart([entry(x, u) for x in rng.normal(0, 1, n)], "t_HT_x").out.mean()
-           for u in (1.0, 0.3) for _ in range(200)]
+    out = [
+        control_chart([entry(x, u) for x in rng.normal(0, 1, n)], "t_HT_x").out.mean()
+        for u in (1.0, 0.3)
+        for _ in range(200)
+    ]
     assert np.mean(out) < alarms
 
 

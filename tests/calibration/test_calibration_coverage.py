@@ -25,8 +25,15 @@ NOISE = PoseNoise(translation=5e-4, rotation=12e-6)
 
 
 def truth_of(free):
-    return Fit(R_HT=MOUNT.R, t_HT=MOUNT.t, t=BALL[None], delta=np.zeros(len(free)), chi2=0.0, converged=True,
-               N=np.zeros((0, 0)))
+    return Fit(
+        R_HT=MOUNT.R,
+        t_HT=MOUNT.t,
+        t=BALL[None],
+        delta=np.zeros(len(free)),
+        chi2=0.0,
+        converged=True,
+        N=np.zeros((0, 0)),
+    )
 
 
 def region_share(errors, C):
@@ -99,9 +106,7 @@ def test_widening_keeps_coverage_when_sigmas_are_too_small():
     poses = paper_poses(2)
     inside = []
     for seed in range(150):
-        cal = calibrate(
-            SCANNER, poses, _understated(poses, seed), hypotheses=False, robust=False, pose_noise=None
-        )
+        cal = calibrate(SCANNER, poses, _understated(poses, seed), hypotheses=False, robust=False, pose_noise=None)
         e = np.concatenate([MOUNT.t - cal.T_HT.t, BALL - cal.t])
         C = cal.covariance[3:, 3:]
         inside.append(e @ np.linalg.solve(C, e) < chdtri(6, 0.05))

@@ -48,18 +48,16 @@ def mistakes():
         "sign of U": (written_as(rotation_from_convention(ANGLES * [-1, 1, 1], "pi-hexapod"), T.t), exact),
         "sign of UVW": (written_as(rotation_from_convention(-ANGLES, "pi-hexapod"), T.t), exact),
         # the angles are those of R_z R_y R_x, and were read as R_x R_y R_z
-        "order ZYX": (
-            written_as(rotation_from_convention(_zyx_angles(T.R), "pi-hexapod"), T.t), exact
-        ),
+        "order ZYX": (written_as(rotation_from_convention(_zyx_angles(T.R), "pi-hexapod"), T.t), exact),
         "pairing lag +1": (
-            written_as(np.roll(T.R, 1, axis=0), np.roll(T.t, 1, axis=0), np.roll(MIXED.alpha, 1)), exact
+            written_as(np.roll(T.R, 1, axis=0), np.roll(T.t, 1, axis=0), np.roll(MIXED.alpha, 1)),
+            exact,
         ),
         "pairing lag -2": (
-            written_as(np.roll(T.R, -2, axis=0), np.roll(T.t, -2, axis=0), np.roll(MIXED.alpha, -2)), exact
+            written_as(np.roll(T.R, -2, axis=0), np.roll(T.t, -2, axis=0), np.roll(MIXED.alpha, -2)),
+            exact,
         ),
-        "angles are radians": (
-            written_as(rotation_from_convention(np.radians(ANGLES), "pi-hexapod"), T.t), exact
-        ),
+        "angles are radians": (written_as(rotation_from_convention(np.radians(ANGLES), "pi-hexapod"), T.t), exact),
     }
 
 

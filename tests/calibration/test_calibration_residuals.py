@@ -20,9 +20,7 @@ def case(scanner, T_HT, rng):
     T_MH = RigidTransform(
         R=exp_rotation(rng.normal(0, 0.2, (n, 3))), t=rng.uniform(-9, 9, (n, 3)), source=Frame.M, target=Frame.H
     )
-    tilted = replace(
-        scanner, eta=0.02, theta=-0.03, phi=0.04, axis_y=0.6, axis_tilt_x=0.011, axis_tilt_y=-0.017
-    )
+    tilted = replace(scanner, eta=0.02, theta=-0.03, phi=0.04, axis_y=0.6, axis_tilt_x=0.011, axis_tilt_y=-0.017)
     return tilted, T_HT, T_MH, rng.uniform(-20, 20, (n, 3)), rng.uniform(-3, 3, n)
 
 
@@ -54,8 +52,11 @@ def test_jacobian_equals_finite_differences(case):
 
     def turned(T, w, *, left=True, shift=0.0):
         E = exp_rotation(w)
-        return replace(T, R=E @ T.R, t=T.t @ E.T + shift) if left else replace(
-            T, R=T.R @ E, t=T.t + T.R @ (np.zeros(3) + shift))
+        return (
+            replace(T, R=E @ T.R, t=T.t @ E.T + shift)
+            if left
+            else replace(T, R=T.R @ E, t=T.t + T.R @ (np.zeros(3) + shift))
+        )
 
     for i in range(3):
         e = eye[i]

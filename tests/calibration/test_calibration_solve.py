@@ -71,8 +71,11 @@ def test_exact_centres_give_the_exact_mount(scanner, rng, plan):
 @pytest.mark.parametrize("plan", ["grid", "mixed", "turned"])
 def test_a_thousand_mounts_are_found_from_no_start(scanner, rng, plan):
     """Exact centres, 1e-9 mm and rad, whatever the mount; in "turned" the poses rotate by up to 180 degrees."""
-    poses = {"grid": grid_poses(2), "mixed": mixed_poses(rng, 30), "turned": PoseSequence.from_table(
-        rng.uniform(-9, 9, (30, 3)), rng.uniform(-180, 180, (30, 3)))}[plan]
+    poses = {
+        "grid": grid_poses(2),
+        "mixed": mixed_poses(rng, 30),
+        "turned": PoseSequence.from_table(rng.uniform(-9, 9, (30, 3)), rng.uniform(-180, 180, (30, 3))),
+    }[plan]
     free = free_parameters((scanner,))
     for _ in range(1000 if plan == "grid" else 150):
         T_HT, t = any_mount(rng), rng.uniform(-10, 10, 3)
@@ -95,9 +98,7 @@ def test_several_balls_have_one_centre_each(scanner, T_HT, rng):
 def test_errors_stay_inside_three_predicted_sigmas(scanner, T_HT, rng):
     poses, t = grid_poses(), np.array([1.0, -2.0, 3.0])
     for _ in range(5):
-        cal = calibrate(
-            scanner, poses, observe(scanner, poses, T_HT, t, 0.0207, rng, said=0.0207), hypotheses=False
-        )
+        cal = calibrate(scanner, poses, observe(scanner, poses, T_HT, t, 0.0207, rng, said=0.0207), hypotheses=False)
         error = np.concatenate([log_rotation(T_HT.R @ cal.T_HT.R.T), T_HT.t - cal.T_HT.t, t - cal.t])
         u = np.sqrt(np.diag(cal.covariance))
         assert (np.abs(error) < 3.7 * u).all()

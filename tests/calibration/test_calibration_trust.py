@@ -68,9 +68,9 @@ def test_outliers_leave_the_fit_of_the_good_centres(plan, low, high):
         problem = pair(SCANNER, poses, replace(clean, x_D=x))
         found = solve(problem, free)
         told = minimise(problem, free, found.fit, weight=np.isin(np.arange(n), bad, invert=True).astype(float))
-        change = np.concatenate([
-            log_rotation(found.fit.R_HT @ told.R_HT.T), found.fit.t_HT - told.t_HT, (found.fit.t - told.t).ravel()
-        ])
+        change = np.concatenate(
+            [log_rotation(found.fit.R_HT @ told.R_HT.T), found.fit.t_HT - told.t_HT, (found.fit.t - told.t).ravel()]
+        )
         assert not found.robust.misfit
         assert (np.abs(change) < np.sqrt(np.diag(found.covariance))).all(), seed
 
@@ -132,8 +132,18 @@ def test_priors_in_the_scanner_are_freed_and_can_be_fixed():
 
 def test_all_parameters_can_be_freed_with_priors():
     priors = {
-        "d_SD": 0.5, "d_SR": 0.1, "u_0": 1, "v_0": 1, "eta": 1e-3, "theta": 5e-3, "phi": 5e-3, "pitch_ratio": 1e-4,
-        "axis_y": 0.01, "axis_tilt_x": 1e-4, "axis_tilt_y": 1e-4, "translation_scale": 1e-4,
+        "d_SD": 0.5,
+        "d_SR": 0.1,
+        "u_0": 1,
+        "v_0": 1,
+        "eta": 1e-3,
+        "theta": 5e-3,
+        "phi": 5e-3,
+        "pitch_ratio": 1e-4,
+        "axis_y": 0.01,
+        "axis_tilt_x": 1e-4,
+        "axis_tilt_y": 1e-4,
+        "translation_scale": 1e-4,
     }
     poses = mixed_poses(n=100)
     cal = calibrate(SCANNER, poses, observe(poses), priors=priors, hypotheses=False)
@@ -161,9 +171,16 @@ def test_translation_scale_is_applied_to_a_scan():
 def test_names_and_numbers_are_checked():
     poses = mixed_poses()
     observed = observe(poses)
-    for bad in ({"priors": {"d_SR": -1.0}}, {"free": ("eta",), "fix": ("eta",)}, {"free": "d_SR"},
-                {"priors": {"p_u": 1e-5, "pitch_ratio": 1e-5}}, {"pose_noise": "much"}, {"pose_noise": (1.0,)},
-                {"model": "soft"}, {"model": "kinematic"}):
+    for bad in (
+        {"priors": {"d_SR": -1.0}},
+        {"free": ("eta",), "fix": ("eta",)},
+        {"free": "d_SR"},
+        {"priors": {"p_u": 1e-5, "pitch_ratio": 1e-5}},
+        {"pose_noise": "much"},
+        {"pose_noise": (1.0,)},
+        {"model": "soft"},
+        {"model": "kinematic"},
+    ):
         with pytest.raises(InputError):
             calibrate(SCANNER, poses, observed, **bad)
 
@@ -175,8 +192,10 @@ def test_two_magnifications_are_solved_together():
     far = replace(SCANNER, d_SR=555.0)
     near_poses, far_poses = paper_poses(2), mixed_poses(n=40)
     together = calibrate(
-        [SCANNER, far], [near_poses, far_poses],
-        [observe(near_poses, seed=1), observe(far_poses, scanner=far, seed=2)], hypotheses=False,
+        [SCANNER, far],
+        [near_poses, far_poses],
+        [observe(near_poses, seed=1), observe(far_poses, scanner=far, seed=2)],
+        hypotheses=False,
     )
     alone = calibrate(SCANNER, near_poses, observe(near_poses, seed=1), hypotheses=False)
     assert (u_of(together) < u_of(alone)).all()
@@ -184,8 +203,11 @@ def test_two_magnifications_are_solved_together():
     assert together.pose_id[0] == "0:0"
     assert len(together.extra["runs"]) == 2
     freed = calibrate(
-        [SCANNER, far], [near_poses, far_poses],
-        [observe(near_poses, seed=None), observe(far_poses, scanner=far, seed=None)], free=("d_SR",), hypotheses=False,
+        [SCANNER, far],
+        [near_poses, far_poses],
+        [observe(near_poses, seed=None), observe(far_poses, scanner=far, seed=None)],
+        free=("d_SR",),
+        hypotheses=False,
     )
     assert freed.tangent[9:] == ("d_SR[0]", "d_SR[1]")
     with pytest.raises(InputError, match="each run needs both"):
@@ -199,7 +221,8 @@ def test_pose_noise_is_told_from_detection_noise():
     poses = mixed_poses(n=150)
     rng = np.random.default_rng(7)
     scattered = replace(
-        poses.T_MH, R=poses.T_MH.R @ exp_rotation(rng.normal(0, 4e-4, (150, 3))),
+        poses.T_MH,
+        R=poses.T_MH.R @ exp_rotation(rng.normal(0, 4e-4, (150, 3))),
         t=poses.T_MH.t + rng.normal(0, 3e-3, (150, 3)),
     )
     observed = observe(replace(poses, T_MH=scattered))
@@ -268,9 +291,7 @@ def test_a_slipped_ball_is_found_with_its_place():
 def test_a_repeated_pose_that_moved_is_found():
     poses = mixed_poses(n=40)
     rows = [*range(40), 0]
-    again = PoseSequence(
-        T_MH=poses.T_MH[rows], alpha=poses.alpha[rows], pose_id=tuple(f"p{k}" for k in range(41))
-    )
+    again = PoseSequence(T_MH=poses.T_MH[rows], alpha=poses.alpha[rows], pose_id=tuple(f"p{k}" for k in range(41)))
     observed = observe(again)
     assert calibrate(SCANNER, again, observed).extra["integrity"]["repeats"][0]["again"] == "p40"
     x = observed.x_D.copy()
@@ -292,7 +313,8 @@ def test_few_poses_do_not_seem_to_drift(n):
     found = [
         e["p"]
         for seed in range(10)
-        for e in calibrate(SCANNER, mixed_poses(seed, n=n), observe(mixed_poses(seed, n=n), seed=seed),
-                           hypotheses=False).extra["integrity"]["effects"]
+        for e in calibrate(
+            SCANNER, mixed_poses(seed, n=n), observe(mixed_poses(seed, n=n), seed=seed), hypotheses=False
+        ).extra["integrity"]["effects"]
     ]
     assert min(found) > 1e-4

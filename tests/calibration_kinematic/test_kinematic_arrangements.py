@@ -105,8 +105,16 @@ def test_exact_data_give_the_exact_trajectory() -> None:
     rigid = calibrate(SCANNER, poses, tight, model="rigid", hypotheses=False)
     cal = calibrate_kinematic(SCANNER, poses, tight, rigid=rigid, manipulator=machine, model="kinematic")
     scan = tilted_scan(T_HT)
-    exact = experiment(machine, p, poses, scan, T_HT=T_HT, balls=[[12.0, -14.0, 10.0]], rng=rng,
-                       disturbance=Disturbance(scatter=Repeatability(t_mm=0.0, w_rad=0.0)))
+    exact = experiment(
+        machine,
+        p,
+        poses,
+        scan,
+        T_HT=T_HT,
+        balls=[[12.0, -14.0, 10.0]],
+        rng=rng,
+        disturbance=Disturbance(scatter=Repeatability(t_mm=0.0, w_rad=0.0)),
+    )
     d = without_object_pose(projection_matrices(cal, scan).P, exact.P_true, object_points())
     assert rms_px(d) < 2e-4
     assert len(e.poses) == len(poses)
@@ -216,9 +224,9 @@ def test_moving_scanner_is_calibrated(machine_errors: bool, rng: np.random.Gener
     true = inverse_poses(real_motion(machine, scan, p))
     home = scanner.T_TW(0.0) @ T_MT
     P = projection_matrices(cal, inverse_poses(scan)).P
-    P_true = np.array([
-        scanner.P_S @ scanner.T_WS.matrix @ home.matrix @ T @ np.linalg.inv(home.matrix) for T in true.T_MH.matrix
-    ])
+    P_true = np.array(
+        [scanner.P_S @ scanner.T_WS.matrix @ home.matrix @ T @ np.linalg.inv(home.matrix) for T in true.T_MH.matrix]
+    )
     rigid = calibrate_inverse(scanner, poses, observations)
     after = rms_px(without_object_pose(P, P_true, object_points()))
     before = rms_px(without_object_pose(projection_matrices(rigid, inverse_poses(scan)).P, P_true, object_points()))
@@ -231,10 +239,12 @@ def test_one_more_number_a_view(rng: np.random.Generator) -> None:
     scanner, poses, T_MT, ball = carm(rng)
     d_SD = scanner.d_SD + 0.5 * rng.standard_normal(len(poses))
     inverse = inverse_poses(poses)
-    x = np.concatenate([
-        project_ball(replace(scanner, d_SD=d), T_HT=T_MT, T_MH=inverse.T_MH[k : k + 1], t=ball)
-        for k, d in enumerate(d_SD)
-    ]) + SIGMA * rng.standard_normal((len(poses), 2))
+    x = np.concatenate(
+        [
+            project_ball(replace(scanner, d_SD=d), T_HT=T_MT, T_MH=inverse.T_MH[k : k + 1], t=ball)
+            for k, d in enumerate(d_SD)
+        ]
+    ) + SIGMA * rng.standard_normal((len(poses), 2))
     observations = BallObservations.from_sigma(x, SIGMA, pose_id=poses.pose_id)
     cal = calibrate_inverse(scanner, poses, observations, d_SD_sigma=0.5, model="rigid")
     assert cal.chi2_dof < 1.4
@@ -356,9 +366,7 @@ def test_planned_poses_beat_random_ones_and_keep_their_promise() -> None:
     candidates = mixed_poses(rng, n=400)
     scan = tilted_scan(T_HT, n=60)
     ball, n = [12.0, -14.0, 10.0], 60
-    call: dict[str, Any] = {
-        "T_HT": T_HT, "balls": ball, "scan": scan, "points": object_points(), "sigma_px": SIGMA
-    }
+    call: dict[str, Any] = {"T_HT": T_HT, "balls": ball, "scan": scan, "points": object_points(), "sigma_px": SIGMA}
     plan = plan_kinematic(SCANNER, machine, candidates=candidates, n=n, **call)
     assert len(plan.poses) == n
     assert len(np.unique(np.round(plan.poses.alpha, 6))) > 1, "table angles are used"
@@ -382,6 +390,12 @@ def test_plans_that_leave_the_view_are_refused() -> None:
     T_HT = RigidTransform.from_angles([0.0, 0.0, np.pi], [0.0, 60.0, 0.0], source=Frame.H, target=Frame.T)
     with pytest.raises(InputError, match="keep the ball in view"):
         plan_kinematic(
-            SCANNER, HEXAPOD, T_HT=T_HT, balls=[0.0, 0, 0], candidates=mixed_poses(np.random.default_rng(0), n=20),
-            scan=tilted_scan(T_HT, n=8), points=object_points(), n=15,
+            SCANNER,
+            HEXAPOD,
+            T_HT=T_HT,
+            balls=[0.0, 0, 0],
+            candidates=mixed_poses(np.random.default_rng(0), n=20),
+            scan=tilted_scan(T_HT, n=8),
+            points=object_points(),
+            n=15,
         )

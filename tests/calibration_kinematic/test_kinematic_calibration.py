@@ -35,7 +35,10 @@ HEXAPOD, ROBOT = typical_hexapod(), typical_robot()
 
 def rigid_of(e: Experiment, **changes: Any) -> Calibration:
     return calibrate(
-        e.scanner, changes.get("poses", e.poses), changes.get("observations", e.observations), model="rigid",
+        e.scanner,
+        changes.get("poses", e.poses),
+        changes.get("observations", e.observations),
+        model="rigid",
         hypotheses=False,
     )
 
@@ -166,8 +169,14 @@ def test_planned_poses_of_a_robot() -> None:
     """With table angles the plan determines the scale; without, it says what it leaves."""
     still, turned = (
         plan_kinematic(
-            SCANNER, ROBOT, T_HT=work.T_HT, balls=[10.0, -8.0, 16.0], candidates=work.candidates, scan=work.scan,
-            points=object_points(), n=40,
+            SCANNER,
+            ROBOT,
+            T_HT=work.T_HT,
+            balls=[10.0, -8.0, 16.0],
+            candidates=work.candidates,
+            scan=work.scan,
+            points=object_points(),
+            n=40,
         )
         for work in (
             robot_work(ROBOT, half_range=10.0, tilt=0.35, spin=2.9, table_angles=angles)

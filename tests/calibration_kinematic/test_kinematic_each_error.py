@@ -50,9 +50,7 @@ def hexapod_with(group: str, size: float = 1.0) -> Experiment:
     p = size * rng.standard_normal(len(ANY.names)) * ANY.sigma
     p[[not name.startswith(group) for name in ANY.names]] = 0.0
     assert p.any()
-    return experiment(
-        ANY, p, mixed_poses(rng), tilted_scan(MOUNT), T_HT=MOUNT, balls=[[12.0, -14.0, 10.0]], rng=rng
-    )
+    return experiment(ANY, p, mixed_poses(rng), tilted_scan(MOUNT), T_HT=MOUNT, balls=[[12.0, -14.0, 10.0]], rng=rng)
 
 
 @pytest.mark.parametrize("group", ["base_joint", "platform_joint", "leg_offset", "leg_scale", "axes"])
@@ -112,7 +110,10 @@ def test_no_other_solver_finds_less(kind: str, seed: int) -> None:
     e = hexapod_experiment(typical_hexapod(), kind, seed)
     data = pair(e.scanner, e.poses, e.observations)
     problem = KinematicProblem(
-        data=data, poses=e.poses, free=free_parameters(data.scanners), model=e.machine,
+        data=data,
+        poses=e.poses,
+        free=free_parameters(data.scanners),
+        model=e.machine,
         repeatability=e.machine.repeatability,
     )
     rigid = calibrate(e.scanner, e.poses, e.observations, model="rigid", hypotheses=False)

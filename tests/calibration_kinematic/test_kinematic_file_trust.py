@@ -76,9 +76,7 @@ def test_right_and_wrong_files_give_a_good_scan(geometry: float, limit: float) -
     for seed in range(6):
         e = hexapod_experiment(HEXAPOD, "mixed", seed, geometry=geometry, wide=True)
         rigid = calibrate(e.scanner, e.poses, e.observations, model="rigid", hypotheses=False)
-        x = scan_error(
-            calibrate_kinematic(e.scanner, e.poses, e.observations, rigid=rigid, manipulator=e.machine), e
-        )
+        x = scan_error(calibrate_kinematic(e.scanner, e.poses, e.observations, rigid=rigid, manipulator=e.machine), e)
         errors.append(x.shared)
         stated.append(x.u_shared)
     rms, said = (float(np.sqrt(np.mean(np.square(v)))) for v in (errors, stated))

@@ -135,15 +135,22 @@ def test_starts_of_the_balls_are_found(twins: TwinExperiment) -> None:
 def test_wrong_calls_are_refused(twins: TwinExperiment) -> None:
     e = twins
     with pytest.raises(InputError, match="no rotary table"):
-        calibrate_twin(e.scanner, replace(e.poses, alpha=np.ones(len(e.poses))), e.observations, twin=e.twin,
-                       mount=e.mount, balls={0: e.ball})
+        calibrate_twin(
+            e.scanner,
+            replace(e.poses, alpha=np.ones(len(e.poses))),
+            e.observations,
+            twin=e.twin,
+            mount=e.mount,
+            balls={0: e.ball},
+        )
     with pytest.raises(InputError, match="ball 0 has none"):
         calibrate_twin(e.scanner, e.poses, e.observations, twin=e.twin, mount=e.mount, balls={})
     with pytest.raises(InputError, match="unknown model"):
         calibrated(e, "magic")
     with pytest.raises(InputError, match="roll and tilt in the mount"):
-        calibrate_twin(replace(e.scanner, eta=0.01), e.poses, e.observations, twin=e.twin, mount=e.mount,
-                       balls={0: e.ball})
+        calibrate_twin(
+            replace(e.scanner, eta=0.01), e.poses, e.observations, twin=e.twin, mount=e.mount, balls={0: e.ball}
+        )
     fewer = replace(e.twin, source_poses=e.twin.source_poses.select(slice(0, 50)))
     with pytest.raises(InputError, match="150 of 200 views have no row in the source robot's table"):
         calibrate_twin(e.scanner, e.poses, e.observations, twin=fewer, mount=e.mount, balls={0: e.ball})

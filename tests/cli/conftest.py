@@ -46,7 +46,9 @@ class Files:
 def files(tmp_path, scanner, T_HT, rng) -> Files:
     n = 30
     poses = tp.PoseSequence.from_table(
-        rng.uniform(-9, 9, (n, 3)), rng.uniform(-6, 6, (n, 3)), pose_id=[f"p{k}" for k in range(n)],
+        rng.uniform(-9, 9, (n, 3)),
+        rng.uniform(-6, 6, (n, 3)),
+        pose_id=[f"p{k}" for k in range(n)],
         alpha=rng.choice([0.0, np.pi / 2, np.pi], n),
     )
     x_D = project_ball(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=T_BALL, alpha=poses.alpha)

@@ -26,17 +26,38 @@ def words(*parts):
 
 
 def calibrate(folder, out, *more):
-    return run(words(
-        "calibrate", "--scanner", folder / "scanner.json", "--poses", folder / "poses.csv", "--observations",
-        folder / "o.csv", "--out", folder / out, "--quiet", *more,
-    ))
+    return run(
+        words(
+            "calibrate",
+            "--scanner",
+            folder / "scanner.json",
+            "--poses",
+            folder / "poses.csv",
+            "--observations",
+            folder / "o.csv",
+            "--out",
+            folder / out,
+            "--quiet",
+            *more,
+        )
+    )
 
 
 def matrices(folder, cal, *more):
-    return run(words(
-        "matrices", "--calibration", folder / cal / "calibration.json", "--poses", folder / "scan.csv", "--out",
-        folder / f"{cal}.npz", "--quiet", "--force", *more,
-    ))
+    return run(
+        words(
+            "matrices",
+            "--calibration",
+            folder / cal / "calibration.json",
+            "--poses",
+            folder / "scan.csv",
+            "--out",
+            folder / f"{cal}.npz",
+            "--quiet",
+            "--force",
+            *more,
+        )
+    )
 
 
 # -- one manipulator that carries source and detector ---------------------------------------------------------------
@@ -47,9 +68,7 @@ def gantry(tmp_path, scanner, rng):
     """A hexapod with joints 0.1 mm off carries the scanner: two standing balls, 150 poses; a tilting scan."""
     machine = replace(typical_hexapod(), scale_sigma=0.0, geometry_sigma=0.0)
     p = rng.standard_normal(len(machine.names)) * machine.sigma
-    mount = tp.RigidTransform.from_angles(
-        [0.02, -0.01, 0.03], [3.0, 1.0, -2.0], source=tp.Frame.H, target=tp.Frame.T
-    )
+    mount = tp.RigidTransform.from_angles([0.02, -0.01, 0.03], [3.0, 1.0, -2.0], source=tp.Frame.H, target=tp.Frame.T)
     balls = np.array([[14.0, -16.0, 15.0], [-11.0, 12.0, -17.0]])
     poses = tp.PoseSequence.from_table(
         rng.uniform(-12, 12, (150, 3)), rng.uniform(-6, 6, (150, 3)), ball_id=np.arange(150) % 2
@@ -77,9 +96,12 @@ def test_moving_scanner_from_files_to_matrices(gantry, capsys):
     moving = ("--arrangement", "moving-scanner")
     length = float(np.linalg.norm(balls[0] - balls[1]))
     assert calibrate(folder, "rigid", *moving, "--model", "rigid") == 3
-    assert calibrate(
-        folder, "auto", *moving, "--manipulator", folder / "hexapod.json", "--distance", f"0,1={length:.4f}(0.0005)"
-    ) == 0
+    assert (
+        calibrate(
+            folder, "auto", *moving, "--manipulator", folder / "hexapod.json", "--distance", f"0,1={length:.4f}(0.0005)"
+        )
+        == 0
+    )
     cal = tp.read_calibration(folder / "auto" / "calibration.json")
     assert cal.model == "kinematic"
     assert cal.manipulator["arrangement"] == "moving-scanner"
@@ -161,9 +183,7 @@ def test_a_convention_that_is_wrong_is_found_for_a_moving_scanner_too(gantry):
     table = tp.read_poses(folder / "poses.csv")
     (folder / "poses.csv").unlink()
     angles = np.degrees(table.T_MH.angles) * [1, -1, 1]
-    tp.write_poses(
-        folder / "poses.csv", tp.PoseSequence.from_table(table.T_MH.t, angles, ball_id=table.ball_id)
-    )
+    tp.write_poses(folder / "poses.csv", tp.PoseSequence.from_table(table.T_MH.t, angles, ball_id=table.ball_id))
     assert calibrate(folder, "cal", "--arrangement", "moving-scanner", "--model", "rigid") == 3
     best = tp.read_calibration(folder / "cal" / "calibration.json").hypotheses[0]
     assert best["name"] == "sign of V"
@@ -180,10 +200,12 @@ def test_one_more_number_a_view(gantry, scanner, rng):
     ball = T_0.apply(mount.inv.apply(np.zeros((1, 3))))[0] + [3.0, 4.0, 5.0]
     d_SD = scanner.d_SD + 0.5 * rng.standard_normal(120)
     turned = tp.inverse_poses(poses)
-    x = np.concatenate([
-        project_ball(replace(scanner, d_SD=d), T_HT=mount, T_MH=turned.T_MH[k : k + 1], t=ball)
-        for k, d in enumerate(d_SD)
-    ]) + SIGMA * rng.standard_normal((120, 2))
+    x = np.concatenate(
+        [
+            project_ball(replace(scanner, d_SD=d), T_HT=mount, T_MH=turned.T_MH[k : k + 1], t=ball)
+            for k, d in enumerate(d_SD)
+        ]
+    ) + SIGMA * rng.standard_normal((120, 2))
     header = "pose_id," + ",".join(f"q{k}_deg" for k in range(1, 7))
     rows = [f"{i}," + ",".join(map(repr, np.degrees(one).tolist())) for i, one in zip(poses.pose_id, q, strict=True)]
     (folder / "poses.csv").write_text("\n".join([header, *rows]) + "\n")
@@ -272,20 +294,31 @@ def twins(tmp_path, monkeypatch):
     e = twin_experiment(typical_robot(), 1)
     scanner = e.scanner
     tp.write_scanner(tmp_path / "scanner.json", scanner)
-    for name, table in (("poses", e.poses), ("source", e.twin.source_poses), ("scan", e.scan),
-                        ("scan_source", e.scan_source)):
+    for name, table in (
+        ("poses", e.poses),
+        ("source", e.twin.source_poses),
+        ("scan", e.scan),
+        ("scan_source", e.scan_source),
+    ):
         tp.write_poses(tmp_path / f"{name}.csv", table)
     tp.write_observations(tmp_path / "o.csv", e.observations)
     write_manipulator(tmp_path / "robot.json", typical_robot())
     T_HS = scanner.T_WS @ scanner.T_TW(0.0) @ e.mount
-    write_twin(tmp_path, {
-        "schema": "tomopose/twin/1", "detector": "robot.json",
-        "source": json.loads((tmp_path / "robot.json").read_text()),
-        "base": {"t_mm": e.twin.base.t.tolist(), "angles_deg": np.degrees(e.twin.base.angles).tolist()},
-        "focus_mm": e.twin.focus.tolist(),
-        "panel": {"origin_mm": (T_HS.R.T @ ([0.0, 0.0, scanner.d_SD] - T_HS.t)).tolist(),
-                  "u_axis": (-T_HS.R[0]).tolist(), "v_axis": T_HS.R[1].tolist()},
-    })
+    write_twin(
+        tmp_path,
+        {
+            "schema": "tomopose/twin/1",
+            "detector": "robot.json",
+            "source": json.loads((tmp_path / "robot.json").read_text()),
+            "base": {"t_mm": e.twin.base.t.tolist(), "angles_deg": np.degrees(e.twin.base.angles).tolist()},
+            "focus_mm": e.twin.focus.tolist(),
+            "panel": {
+                "origin_mm": (T_HS.R.T @ ([0.0, 0.0, scanner.d_SD] - T_HS.t)).tolist(),
+                "u_axis": (-T_HS.R[0]).tolist(),
+                "v_axis": T_HS.R[1].tolist(),
+            },
+        },
+    )
     return tmp_path, e
 
 
@@ -339,8 +372,9 @@ def test_joint_values_alone_serve_twin_robots(twins):
     for name in ("poses", "source", "scan", "scan_source"):
         table = tp.read_poses(folder / f"{name}.csv")
         header = "pose_id," + ",".join(f"q{k}_deg" for k in range(1, 7))
-        rows = [f"{i}," + ",".join(map(repr, np.degrees(q).tolist()))
-                for i, q in zip(table.pose_id, table.q, strict=True)]
+        rows = [
+            f"{i}," + ",".join(map(repr, np.degrees(q).tolist())) for i, q in zip(table.pose_id, table.q, strict=True)
+        ]
         (folder / f"{name}.csv").write_text("\n".join([header, *rows]) + "\n")
     assert calibrate(folder, "auto", *twin_words(folder)) == 0
     assert matrices(folder, "auto", "--source-poses", folder / "scan_source.csv") == 0
@@ -361,8 +395,12 @@ def test_a_pitch_may_be_freed_and_the_mount_takes_the_rest(twins, capsys):
     assert abs(ratio.value - e.scanner.p_u / e.scanner.p_v) < 4 * ratio.u < 2e-3
     assert matrices(folder, "free", "--source-poses", folder / "scan_source.csv") == 0
     assert twin_error(tp.read_matrices(folder / "free.npz"), e, e.middle + CORNERS)[0] < 0.06
-    for name, told in (("d_SD", "taken up exactly by the mount"), ("eta", "taken up exactly by the mount"),
-                       ("d_SR", "where W begins"), ("translation_scale", "no meaning for two robots")):
+    for name, told in (
+        ("d_SD", "taken up exactly by the mount"),
+        ("eta", "taken up exactly by the mount"),
+        ("d_SR", "where W begins"),
+        ("translation_scale", "no meaning for two robots"),
+    ):
         assert calibrate(folder, "x", *twin_words(folder, "--free", name)) == 1
         assert told in capsys.readouterr().err
 

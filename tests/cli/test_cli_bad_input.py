@@ -80,9 +80,7 @@ def test_unknown_convention(files, capsys):
 
 
 def test_poses_without_rotation(files, capsys, scanner, T_HT):
-    still = tp.PoseSequence.from_table(
-        files.poses.T_MH.t, np.zeros((len(files.poses), 3)), pose_id=files.poses.pose_id
-    )
+    still = tp.PoseSequence.from_table(files.poses.T_MH.t, np.zeros((len(files.poses), 3)), pose_id=files.poses.pose_id)
     x_D = project(scanner, T_HT, still)
     tp.write_poses(files.folder / "still.csv", still)
     tp.write_observations(
@@ -98,9 +96,7 @@ def test_rotations_about_one_axis_only(files, capsys, scanner, T_HT, rng):
     one = tp.PoseSequence.from_table(files.poses.T_MH.t, angles, pose_id=files.poses.pose_id)
     tp.write_poses(files.folder / "one.csv", one)
     x_D = project(scanner, T_HT, one)
-    tp.write_observations(
-        files.folder / "one_obs.csv", tp.BallObservations.from_sigma(x_D, 0.01, pose_id=one.pose_id)
-    )
+    tp.write_observations(files.folder / "one_obs.csv", tp.BallObservations.from_sigma(x_D, 0.01, pose_id=one.pose_id))
     words = files.calibrate(poses=files.folder / "one.csv", observations=files.folder / "one_obs.csv")
     refused(files, capsys, words, "axis")
 

@@ -29,8 +29,18 @@ def radiographs(tmp_path_factory):
 
 
 def words(folder, verb, out, *more):
-    return [verb, "--scanner", str(folder / "scanner.json"), "--images", str(folder / RADIOGRAPHS), "--poses",
-            str(folder / "poses.csv"), "--out", str(out), *more]
+    return [
+        verb,
+        "--scanner",
+        str(folder / "scanner.json"),
+        "--images",
+        str(folder / RADIOGRAPHS),
+        "--poses",
+        str(folder / "poses.csv"),
+        "--out",
+        str(out),
+        *more,
+    ]
 
 
 def test_detect_writes_a_row_for_each_radiograph_and_names_the_missing_flat_field(radiographs, tmp_path, capsys):

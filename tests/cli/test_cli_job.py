@@ -132,9 +132,7 @@ def test_a_rival_that_fits_better_is_exit_code_3(files, capsys):
     """Rows exchanged among poses: the files are well formed, but the reading of them is wrong."""
     wrong = files.folder / "signs.csv"
     angles = np.degrees(files.poses.T_MH.angles) * [-1, -1, -1]
-    poses = tp.PoseSequence.from_table(
-        files.poses.T_MH.t, angles, pose_id=files.poses.pose_id, alpha=files.poses.alpha
-    )
+    poses = tp.PoseSequence.from_table(files.poses.T_MH.t, angles, pose_id=files.poses.pose_id, alpha=files.poses.alpha)
     tp.write_poses(wrong, poses)
     words = ["diagnose", "--scanner", str(files.folder / "scanner.json"), "--poses", str(wrong)]
     assert run([*words, "--observations", str(files.folder / "observations.csv"), "--json"]) == 3

@@ -38,9 +38,7 @@ def erring(tmp_path, scanner, T_HT):
     tp.write_poses(tmp_path / "scan.csv", scan)
     tp.write_observations(tmp_path / "o.csv", tp.BallObservations.from_sigma(x_D, 0.01, pose_id=poses.pose_id))
     write_manipulator(tmp_path / "hexapod.json", machine)
-    truth = eq5_matrices(
-        scanner, T_HT=T_HT, T_MH=real_motion(machine, scan, p).T_MH, alpha=scan.alpha
-    )
+    truth = eq5_matrices(scanner, T_HT=T_HT, T_MH=real_motion(machine, scan, p).T_MH, alpha=scan.alpha)
     return tmp_path, machine, p, scan, truth
 
 
@@ -130,8 +128,19 @@ def test_a_robot_alone_is_told_that_its_links_hold_the_scale(tmp_path, monkeypat
         tp.write_poses(folder / "poses.csv", e.poses)
         tp.write_observations(folder / "o.csv", e.observations)
         write_manipulator(folder / "robot.json", robot)
-        words = ["calibrate", "--scanner", folder / "scanner.json", "--poses", folder / "poses.csv", "--observations",
-                 folder / "o.csv", "--manipulator", folder / "robot.json", "--out", folder / "cal"]
+        words = [
+            "calibrate",
+            "--scanner",
+            folder / "scanner.json",
+            "--poses",
+            folder / "poses.csv",
+            "--observations",
+            folder / "o.csv",
+            "--manipulator",
+            folder / "robot.json",
+            "--out",
+            folder / "cal",
+        ]
         assert run([*map(str, words)]) == 0
         text = capsys.readouterr().out
         assert "errors of the manipulator" in text
@@ -143,8 +152,21 @@ def test_plan_for_a_robot_says_what_the_table_angles_are_for(erring, capsys):
 
     folder = erring[0]
     write_manipulator(folder / "robot.json", typical_robot())
-    words = ["plan", "poses", "--optimal", "--for", "kinematic", "--scanner", folder / "scanner.json", "--images", "30",
-             "--manipulator", folder / "robot.json", "--tilt-deg", "20"]
+    words = [
+        "plan",
+        "poses",
+        "--optimal",
+        "--for",
+        "kinematic",
+        "--scanner",
+        folder / "scanner.json",
+        "--images",
+        "30",
+        "--manipulator",
+        folder / "robot.json",
+        "--tilt-deg",
+        "20",
+    ]
     for angles, out in (("0", "still.csv"), ("0,90,180", "turned.csv")):
         assert run([*map(str, [*words, "--table-angles-deg", angles, "--out", folder / out])]) == 0
         told = capsys.readouterr().out

@@ -106,8 +106,13 @@ def _coverage(distance: Array, low: Array, high: Array) -> Array:
 
 def _tube_chord(scene: Scene, d: Array, c: Array) -> Array:
     """Path through a half-infinite tube whose end lies at the ball's centre (plus tube_top) and points up (+y)."""
-    axis = np.array([np.sin(scene.tube_roll), np.cos(scene.tube_roll) * np.cos(scene.tube_tilt),
-                     np.cos(scene.tube_roll) * np.sin(scene.tube_tilt)])
+    axis = np.array(
+        [
+            np.sin(scene.tube_roll),
+            np.cos(scene.tube_roll) * np.cos(scene.tube_tilt),
+            np.cos(scene.tube_roll) * np.sin(scene.tube_tilt),
+        ]
+    )
     da, ca = np.einsum("i,ijk->jk", axis, d), axis @ c
     perpendicular = d - axis[:, None, None] * da
     centre = c - axis * ca
@@ -153,8 +158,9 @@ def derivatives(scene: Scene, box: dict[str, int]) -> Array:
         x = scene.x_D + np.array([change.get("u", 0.0), change.get("v", 0.0)])
         shifted = centre_at(scene.scanner, x[0], x[1], abs(scene.centre[2]))
         delta = np.asarray(shifted) - np.asarray(scene.centre)
-        new = replace(scene, centre=shifted, radius=scene.radius + change.get("r", 0.0),
-                      blur=scene.blur + change.get("blur", 0.0))
+        new = replace(
+            scene, centre=shifted, radius=scene.radius + change.get("r", 0.0), blur=scene.blur + change.get("blur", 0.0)
+        )
         return _fixed_tube(new, delta, box)
 
     h, hr, hs = 0.05, 0.005, 0.01
@@ -202,6 +208,10 @@ def scene_of(
     diameter = 2 * radius_px * p * d_SR / 1500.0
     scanner = Scanner(d_SD=1500.0, d_SR=d_SR, p_u=pitch[0], p_v=pitch[1], u_0=0.49 * n, v_0=0.53 * n, n_u=n, n_v=n - 23)
     size = diameter / 8.0
-    values: dict[str, object] = {"radius": diameter / 2, "tube_inner": 4.0 * size, "tube_outer": 6.0 * size,
-                                 "mu_tube": PEEK / size}
+    values: dict[str, object] = {
+        "radius": diameter / 2,
+        "tube_inner": 4.0 * size,
+        "tube_outer": 6.0 * size,
+        "mu_tube": PEEK / size,
+    }
     return Scene(scanner=scanner, centre=centre_at(scanner, u, v, d_SR), **{**values, **change})  # type: ignore[arg-type]

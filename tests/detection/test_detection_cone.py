@@ -53,12 +53,8 @@ def test_distance_is_zero_on_the_rim_and_its_derivatives_hold(tilted: Scanner) -
     assert np.abs(rim[0]).max() < 1e-8
     assert rim[4] ** 2 + rim[5] ** 2 == pytest.approx(np.ones(40))
     h = 1e-4
-    assert (s(x_D[0] + h, x_D[1], gamma) - s(x_D[0] - h, x_D[1], gamma))[0] / (2 * h) == pytest.approx(
-        rim[1], abs=1e-5
-    )
-    assert (s(x_D[0], x_D[1] + h, gamma) - s(x_D[0], x_D[1] - h, gamma))[0] / (2 * h) == pytest.approx(
-        rim[2], abs=1e-5
-    )
+    assert (s(x_D[0] + h, x_D[1], gamma) - s(x_D[0] - h, x_D[1], gamma))[0] / (2 * h) == pytest.approx(rim[1], abs=1e-5)
+    assert (s(x_D[0], x_D[1] + h, gamma) - s(x_D[0], x_D[1] - h, gamma))[0] / (2 * h) == pytest.approx(rim[2], abs=1e-5)
 
 
 @pytest.mark.parametrize("kappa", [np.inf, 1.7])

@@ -48,8 +48,10 @@ def run() -> tuple[Scanner, list[np.ndarray], np.ndarray]:
 
 
 def same(a: BallObservations, b: BallObservations) -> bool:
-    return a.x_D.tobytes() == b.x_D.tobytes() and a.covariance.tobytes() == b.covariance.tobytes() and (
-        a.status == b.status
+    return (
+        a.x_D.tobytes() == b.x_D.tobytes()
+        and a.covariance.tobytes() == b.covariance.tobytes()
+        and (a.status == b.status)
     )
 
 

@@ -33,7 +33,10 @@ def test_eight_lanes_give_the_same(tmp_path):
     # A cache of its own: numba files compiled code by processor, and this one is lied to about it.
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, os.path.dirname(__file__)], env=environment, capture_output=True, text=True,
+        [sys.executable, "-c", PROGRAM, os.path.dirname(__file__)],
+        env=environment,
+        capture_output=True,
+        text=True,
         check=False,
     )
     assert done.returncode == 0, done.stderr

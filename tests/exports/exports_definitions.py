@@ -60,7 +60,12 @@ def astra(folder, x):
 def leap(folder, x):
     a = np.load(folder / "leap.npz")
     assert set(a.files) == {
-        "source_positions", "module_centers", "row_vectors", "col_vectors", "pixel_height", "pixel_width"
+        "source_positions",
+        "module_centers",
+        "row_vectors",
+        "col_vectors",
+        "pixel_height",
+        "pixel_width",
     }
     for name in ("row_vectors", "col_vectors"):
         np.testing.assert_allclose(np.linalg.norm(a[name], axis=1), 1, atol=1e-9)
@@ -81,7 +86,15 @@ def cil(folder, x):
 def tigre(folder, x):
     a = np.load(folder / "tigre.npz")
     assert set(a.files) == {
-        "DSO", "DSD", "angles", "offDetector", "rotDetector", "nDetector", "dDetector", "offOrigin", "COR"
+        "DSO",
+        "DSD",
+        "angles",
+        "offDetector",
+        "rotDetector",
+        "nDetector",
+        "dDetector",
+        "offOrigin",
+        "COR",
     }
     assert row0(folder, "tigre") == "bottom"
     assert not a["offOrigin"].any()
@@ -216,6 +229,4 @@ def ctsimu(folder, x):
     return on_panel(S, C, U, V, x, detector["columns"]["value"], detector["rows"]["value"])
 
 
-DEFINITIONS = {
-    f.__name__: f for f in (astra, rtk, rtk_params, leap, tigre, cil, cera, openct, ctsimu, pyronn)
-}
+DEFINITIONS = {f.__name__: f for f in (astra, rtk, rtk_params, leap, tigre, cil, cera, openct, ctsimu, pyronn)}

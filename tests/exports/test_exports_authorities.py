@@ -78,9 +78,7 @@ def test_our_cera_and_openct_matrices_are_those_of_ctsimu(matrices, folder):
     ours = np.array(json.loads((folder / "openct.json").read_text())["projections"]["matrices"])
     np.testing.assert_allclose(pixels(ours, X), pixels(ctsimu_matrices(scenario, "OpenCT"), X), rtol=0, atol=1e-7)
     cera = read_geometry(folder, format="cera").P
-    np.testing.assert_allclose(
-        pixels(cera, X), pixels(ctsimu_matrices(scenario, "CERA"), X), rtol=0, atol=TOLERANCE_PX
-    )
+    np.testing.assert_allclose(pixels(cera, X), pixels(ctsimu_matrices(scenario, "CERA"), X), rtol=0, atol=TOLERANCE_PX)
 
 
 def test_we_read_what_ctsimu_writes_for_cera_and_openct(matrices, folder, tmp_path):
@@ -96,11 +94,17 @@ def test_we_read_what_ctsimu_writes_for_cera_and_openct(matrices, folder, tmp_pa
     theirs = tmp_path / "theirs"
     theirs.mkdir()
     ctsimu.create_CERA_config(
-        geo=start, projection_file_pattern="p_%04d.tif", basename="scan", save_dir=str(theirs),
-        n_projections=len(matrices), matrices=as_matrices("CERA"),
+        geo=start,
+        projection_file_pattern="p_%04d.tif",
+        basename="scan",
+        save_dir=str(theirs),
+        n_projections=len(matrices),
+        matrices=as_matrices("CERA"),
     )
     ctsimu.create_OpenCT_config(
-        geo=start, filename=str(theirs / "scan.json"), projection_files=[f"{k}.tif" for k in range(len(matrices))],
+        geo=start,
+        filename=str(theirs / "scan.json"),
+        projection_files=[f"{k}.tif" for k in range(len(matrices))],
         matrices=as_matrices("OpenCT"),
     )
     for name in ("scan.config", "scan.json"):
@@ -120,6 +124,7 @@ def drift(values, unit="mm", known=True):
 
 def general_scenario(direction, final, n=11):
     """A scenario nothing of which is ours: a turning stage, tilted parts, pivots, drifts of every length."""
+
     def xyz(x, y, z):
         return {k: {"value": v} for k, v in zip("xyz", (x, y, z), strict=True)}
 
@@ -127,13 +132,21 @@ def general_scenario(direction, final, n=11):
         return {"x": quantity(x, "mm", *drifts), "y": quantity(y, "mm"), "z": quantity(z / 10, "cm")}
 
     def turn(axis, degrees, *drifts, pivot=None, known=True):
-        d = {"type": "rotation", "axis": axis, "amount": quantity(degrees, "deg", *drifts),
-             "known_to_reconstruction": known}
+        d = {
+            "type": "rotation",
+            "axis": axis,
+            "amount": quantity(degrees, "deg", *drifts),
+            "known_to_reconstruction": known,
+        }
         return d if pivot is None else {**d, "pivot": pivot}
 
     def shift(axis, mm, *drifts):
-        return {"type": "translation", "axis": axis, "amount": quantity(mm, "mm", *drifts),
-                "known_to_reconstruction": True}
+        return {
+            "type": "translation",
+            "axis": axis,
+            "amount": quantity(mm, "mm", *drifts),
+            "known_to_reconstruction": True,
+        }
 
     world_pivot = {k: quantity(v) for k, v in zip("xyz", (30.0, -4.0, 2.0), strict=True)}
     own_pivot = {k: quantity(v) for k, v in zip("uvw", (3.0, 5.0, -2.0), strict=True)}
@@ -142,17 +155,20 @@ def general_scenario(direction, final, n=11):
         "geometry": {
             "detector": {
                 "center": position(900, 11, -6, drift([0.0, 0.5, -0.2])),
-                "vector_u": xyz(0, -1, 0), "vector_w": xyz(1, 0, 0),
+                "vector_u": xyz(0, -1, 0),
+                "vector_w": xyz(1, 0, 0),
                 "deviations": [turn("u", 0.7), turn("z", -1.1, drift([0, 0.3], "deg"), pivot=own_pivot)],
             },
             "source": {
                 "center": position(0.3, -0.2, 0.1),
-                "vector_u": xyz(0, -1, 0), "vector_w": xyz(1, 0, 0),
+                "vector_u": xyz(0, -1, 0),
+                "vector_w": xyz(1, 0, 0),
                 "deviations": [shift("y", 0.4, drift([0.1] * n)), shift("w", 1.5), turn("x", 2.0, pivot=world_pivot)],
             },
             "stage": {
                 "center": position(250, 1.5, -2.5, drift([0, 1, -1, 2]), drift([5.0] * n, "mm", False)),
-                "vector_u": xyz(2, 0, 0), "vector_w": xyz(0, 0, 3),
+                "vector_u": xyz(2, 0, 0),
+                "vector_w": xyz(0, 0, 3),
                 "deviations": [
                     turn("v", 3.0, drift([-0.5, 0.25, 0.5, 0.1], "deg")),
                     turn({k: {"value": v} for k, v in zip("uvw", (1, 0.5, -0.2), strict=True)}, -2.0, pivot=own_pivot),
@@ -164,14 +180,21 @@ def general_scenario(direction, final, n=11):
         },
         "source": {"model": "any"},
         "detector": {
-            "type": "ideal", "columns": {"value": 301}, "rows": {"value": 257},
+            "type": "ideal",
+            "columns": {"value": 301},
+            "rows": {"value": 257},
             "pixel_pitch": {"u": quantity(0.2), "v": quantity(250, "um")},
         },
         "acquisition": {
-            "start_angle": quantity(10, "deg"), "stop_angle": quantity(370, "deg"), "direction": direction,
-            "scan_mode": "stop+go", "number_of_projections": n, "include_final_angle": final,
+            "start_angle": quantity(10, "deg"),
+            "stop_angle": quantity(370, "deg"),
+            "direction": direction,
+            "scan_mode": "stop+go",
+            "number_of_projections": n,
+            "include_final_angle": final,
         },
-        "samples": [], "materials": [],
+        "samples": [],
+        "materials": [],
     }
 
 
@@ -227,8 +250,14 @@ def test_rtk_finds_the_same_nine_parameters(matrices, folder):
     reader.SetFilename(str(folder / "rtk.xml"))
     reader.GenerateOutputInformation()
     ours = reader.GetOutputObject()
-    for name in ("SourceToIsocenterDistances", "SourceToDetectorDistances", "SourceOffsetsX", "SourceOffsetsY",
-                 "ProjectionOffsetsX", "ProjectionOffsetsY"):
+    for name in (
+        "SourceToIsocenterDistances",
+        "SourceToDetectorDistances",
+        "SourceOffsetsX",
+        "SourceOffsetsY",
+        "ProjectionOffsetsX",
+        "ProjectionOffsetsY",
+    ):
         a, b = (np.array(getattr(g, f"Get{name}")()) for g in (ours, theirs))
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-8, err_msg=name)
     for name in ("GantryAngles", "OutOfPlaneAngles", "InPlaneAngles"):
@@ -255,8 +284,13 @@ def test_rtk_draws_a_sphere_where_the_matrices_put_it(tmp_path):
     rtk, itk = rtk_module(), package("itk")
     rng = np.random.default_rng(4)
     matrices = matrices_of(
-        Rotation.random(4, random_state=rng).as_matrix(), np.tile([400.0, 1000.0], (4, 1)),
-        np.hstack([rng.uniform(-3, 3, (4, 2)), rng.uniform(-5, 5, (4, 2))]), n_u=61, n_v=55, p_u=1.0, p_v=1.25,
+        Rotation.random(4, random_state=rng).as_matrix(),
+        np.tile([400.0, 1000.0], (4, 1)),
+        np.hstack([rng.uniform(-3, 3, (4, 2)), rng.uniform(-5, 5, (4, 2))]),
+        n_u=61,
+        n_v=55,
+        p_u=1.0,
+        p_v=1.25,
     )
     export(matrices, tmp_path / "out", formats="rtk")
     side = json.loads((tmp_path / "out" / "rtk.json").read_text())

@@ -54,8 +54,10 @@ def test_rtk_turns_its_gantry_about_its_own_axis(tmp_path):
     """An aligned circular scan has gantry angles only: the condition for RTK's FDK and its angular weights."""
     export(circular_matrices(n=8), tmp_path / "out", formats=["rtk"])
     text = (tmp_path / "out" / "rtk.xml").read_text()
-    angles = {k: [float(s.split("<")[0]) for s in text.split(f"<{k}>")[1:]] for k in
-              ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle")}
+    angles = {
+        k: [float(s.split("<")[0]) for s in text.split(f"<{k}>")[1:]]
+        for k in ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle")
+    }
     turn = np.exp(1j * np.radians(angles["GantryAngle"]))
     np.testing.assert_allclose(turn, np.exp(-2j * np.pi * np.arange(8) / 8), atol=1e-12)
     for k in ("OutOfPlaneAngle", "InPlaneAngle"):
@@ -66,6 +68,13 @@ def test_only_the_formats_that_can_follow_the_row_order(tmp_path):
     export(random_matrices(5), tmp_path / "out", rows="top")
     order = {name: entry["row0"] for name, entry in manifest(tmp_path / "out")["formats"].items()}
     assert order == {
-        "astra": "top", "rtk": "bottom", "leap": "top", "tigre": "bottom", "cil": "top", "cera": "top",
-        "openct": "bottom", "ctsimu": "bottom", "pyronn": "top",
+        "astra": "top",
+        "rtk": "bottom",
+        "leap": "top",
+        "tigre": "bottom",
+        "cil": "top",
+        "cera": "top",
+        "openct": "bottom",
+        "ctsimu": "bottom",
+        "pyronn": "top",
     }

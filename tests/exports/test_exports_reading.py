@@ -15,8 +15,17 @@ from tomopose.exports import FORMATS, export, read_geometry
 from tomopose.exports.openct import FRAMES, detector_frame
 
 X = points(m=6)
-MAIN_FILE = {"astra": "astra.npy", "rtk": "rtk.xml", "leap": "leap.npz", "tigre": "tigre.npz", "cil": "cil.npz",
-             "cera": "cera.config", "openct": "openct.json", "ctsimu": "ctsimu.json", "pyronn": "pyronn.npz"}
+MAIN_FILE = {
+    "astra": "astra.npy",
+    "rtk": "rtk.xml",
+    "leap": "leap.npz",
+    "tigre": "tigre.npz",
+    "cil": "cil.npz",
+    "cera": "cera.config",
+    "openct": "openct.json",
+    "ctsimu": "ctsimu.json",
+    "pyronn": "pyronn.npz",
+}
 
 
 @pytest.fixture
@@ -70,8 +79,11 @@ def test_files_alone_with_all_options(format, named, bare, matrices):
 
 @pytest.mark.parametrize(
     ("format", "needs"),
-    [("astra", ["n_u", "n_v", "rows"]), ("leap", ["n_u", "n_v", "rows"]),
-     ("pyronn", ["n_u", "n_v", "p_u", "p_v", "rows"])],
+    [
+        ("astra", ["n_u", "n_v", "rows"]),
+        ("leap", ["n_u", "n_v", "rows"]),
+        ("pyronn", ["n_u", "n_v", "p_u", "p_v", "rows"]),
+    ],
 )
 def test_a_missing_option_is_named(format, needs, bare, matrices):
     for name in needs:
@@ -79,8 +91,12 @@ def test_a_missing_option_is_named(format, needs, bare, matrices):
         del given[name]
         with pytest.raises(InputError, match=rf"does not hold {name}; give {name} \(--{name.split('_')[0]}"):
             read_geometry(bare / MAIN_FILE[format], **given)
-    assert_same(read_geometry(bare / MAIN_FILE[format], rows="bottom", **{
-        k: v for k, v in options(matrices).items() if k in needs}), matrices)
+    assert_same(
+        read_geometry(
+            bare / MAIN_FILE[format], rows="bottom", **{k: v for k, v in options(matrices).items() if k in needs}
+        ),
+        matrices,
+    )
 
 
 @pytest.mark.parametrize("format", ["cil", "tigre", "cera", "openct", "ctsimu"])
@@ -155,8 +171,11 @@ def test_a_format_is_never_guessed_from_thin_air(bare):
 
 def test_nothing_is_typed_twice(matrices, tmp_path):
     export(matrices, tmp_path / "out", rows="top")
-    for path in (tmp_path / "out", tmp_path / "out" / "manifest.json",
-                 *(tmp_path / "out" / name for name in MAIN_FILE.values())):
+    for path in (
+        tmp_path / "out",
+        tmp_path / "out" / "manifest.json",
+        *(tmp_path / "out" / name for name in MAIN_FILE.values()),
+    ):
         back = read_geometry(path)
         assert_same(back, matrices)
         assert back.pose_id == matrices.pose_id
@@ -207,8 +226,13 @@ def test_a_truncated_file_is_refused(format, bare, matrices):
     for part in (0.02, 0.3, 0.7, 0.97):
         path.write_bytes(whole[: int(part * len(whole))])
         with pytest.raises(TomoposeError):
-            read_geometry(path, format=format, rows="bottom", side=bare / "rtk.json" if format == "rtk" else None,
-                          **options(matrices))
+            read_geometry(
+                path,
+                format=format,
+                rows="bottom",
+                side=bare / "rtk.json" if format == "rtk" else None,
+                **options(matrices),
+            )
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -260,8 +284,14 @@ def test_npz_files_may_be_json_with_the_same_keys(bare, matrices):
 
 @pytest.mark.parametrize(
     ("given", "words"),
-    [({"n_u": 0}, "n_u is 0"), ({"n_u": 10.5}, "n_u is 10.5"), ({"n_v": -3}, "n_v is -3"), ({"p_u": 0.0}, "p_u is 0.0"),
-     ({"p_v": np.nan}, "p_v is nan"), ({"p_v": np.inf}, "p_v is inf")],
+    [
+        ({"n_u": 0}, "n_u is 0"),
+        ({"n_u": 10.5}, "n_u is 10.5"),
+        ({"n_v": -3}, "n_v is -3"),
+        ({"p_u": 0.0}, "p_u is 0.0"),
+        ({"p_v": np.nan}, "p_v is nan"),
+        ({"p_v": np.inf}, "p_v is inf"),
+    ],
 )
 @pytest.mark.parametrize("format", ["pyronn", "astra", "openct"])
 def test_options_that_make_no_sense(format, given, words, bare, matrices):
@@ -367,6 +397,7 @@ def test_rtk_by_parameters_alone(bare, matrices, part):
 
 def test_rtk_stacks_that_run_from_the_top(bare, matrices):
     """direction [1, -1] with the origin in the top pixel describes the same panel."""
+
     def flip(side):
         side["origin"][1] += (matrices.n_v - 1) * matrices.p_v
         side["direction"] = [1, -1, 1]
@@ -406,8 +437,12 @@ def test_rtk_side_files_that_say_too_little(change, words, bare):
         (r"<GantryAngle>([^<]*)</GantryAngle>", r"<GantryTilt>\1</GantryTilt>", InputError, "unknown element"),
         (r"<SourceToIsocenterDistance>", "<SourceToIsocenterDistance>-", InputError, "both must be positive"),
         (r"<Matrix>\s*\S+", "<Matrix>", InputError, "Matrix of view 0"),
-        (r"<Projection>", "<RadiusCylindricalDetector>900</RadiusCylindricalDetector>\n<Projection>", InputError,
-         "cylinder"),
+        (
+            r"<Projection>",
+            "<RadiusCylindricalDetector>900</RadiusCylindricalDetector>\n<Projection>",
+            InputError,
+            "cylinder",
+        ),
         (r"<!DOCTYPE RTKGEOMETRY>", '<!DOCTYPE RTKGEOMETRY [<!ENTITY a "b">]>', InputError, "entities"),
     ],
 )
@@ -486,7 +521,9 @@ def test_openct_in_every_detector_frame(frame, dimension, bare, matrices):
 
     def rewrite(content):
         content["projections"] |= {
-            "detectorCoordinateFrame": frame, "detectorCoordinateDimension": dimension, "matrices": (A @ m.P).tolist()
+            "detectorCoordinateFrame": frame,
+            "detectorCoordinateDimension": dimension,
+            "matrices": (A @ m.P).tolist(),
         }
 
     assert_same(read_geometry(edit(bare / "openct.json", rewrite)), m)
@@ -537,16 +574,22 @@ def stage(content):
         (lambda d: d["acquisition"].update(direction="left"), InputError, "direction"),
         (lambda d: d["acquisition"].pop("start_angle"), InputError, "start_angle is missing"),
         (lambda d: d["acquisition"]["stop_angle"].update(value=-5), InputError, "lies before"),
-        (lambda d: d["acquisition"]["stop_angle"].pop("unit") and d["acquisition"]["stop_angle"].update(value=90),
-         UnitError, "unit is 'missing'"),
+        (
+            lambda d: d["acquisition"]["stop_angle"].pop("unit") and d["acquisition"]["stop_angle"].update(value=90),
+            UnitError,
+            "unit is 'missing'",
+        ),
         (lambda d: d["acquisition"].update(pixel_binning={"u": 2, "v": 1}), InputError, "pixel_binning.u is 2"),
         (lambda d: d["geometry"]["source"].update(type="parallel"), InputError, "parallel"),
         (lambda d: stage(d).pop("center"), InputError, "'center'"),
         (lambda d: stage(d).update(center={k: {"value": 0} for k in "uvw"}), InputError, "'u' is not read|attached"),
         (lambda d: stage(d).update(deviation={}), InputError, "'deviation' is not read"),
         (lambda d: stage(d)["center"]["x"].update(unit="inch"), UnitError, "inch"),
-        (lambda d: stage(d)["center"]["x"].update(drift=stage(d)["center"]["x"].pop("drifts")), InputError,
-         "'drift' is not read"),
+        (
+            lambda d: stage(d)["center"]["x"].update(drift=stage(d)["center"]["x"].pop("drifts")),
+            InputError,
+            "'drift' is not read",
+        ),
         (lambda d: stage(d)["center"]["x"]["drifts"][0].update(value=None, file="x.csv"), InputError, "x.csv"),
         (lambda d: stage(d)["center"]["x"]["drifts"][0].update(value=[]), InputError, "no values"),
         (lambda d: stage(d)["center"]["x"]["drifts"][0].update(known_to_reconstruction="yes"), InputError, "'yes'"),
@@ -582,10 +625,18 @@ def test_ctsimu_by_hand():
             "detector": {"center": xyz(1240, 0, 0, unit="mm"), **upright},
             "stage": {"center": xyz(31, 0, 0, unit="cm"), "vector_u": xyz(1, 0, 0), "vector_w": xyz(0, 0, 1)},
         },
-        "detector": {"columns": {"value": 101}, "rows": {"value": 81},
-                     "pixel_pitch": {"u": {"value": 0.2, "unit": "mm"}, "v": {"value": 250, "unit": "um"}}},
-        "acquisition": {"start_angle": {"value": 0, "unit": "deg"}, "stop_angle": {"value": 360, "unit": "deg"},
-                        "direction": "CCW", "number_of_projections": 4, "include_final_angle": False},
+        "detector": {
+            "columns": {"value": 101},
+            "rows": {"value": 81},
+            "pixel_pitch": {"u": {"value": 0.2, "unit": "mm"}, "v": {"value": 250, "unit": "um"}},
+        },
+        "acquisition": {
+            "start_angle": {"value": 0, "unit": "deg"},
+            "stop_angle": {"value": 360, "unit": "deg"},
+            "direction": "CCW",
+            "number_of_projections": 4,
+            "include_final_angle": False,
+        },
     }
     m = from_ctsimu(scenario, Given())
     # Magnification 4: a point 1 mm along +y of W lies 4 mm to the right, one along +z 4 mm up; the object turns

@@ -115,8 +115,18 @@ def test_the_folder_holds_the_prescribed_files_and_its_manifest_says_what_they_a
     matrices = random_matrices(18)
     done = export(matrices, tmp_path / "out")
     assert {p.name for p in (tmp_path / "out").iterdir()} == {
-        "manifest.json", "astra.npy", "rtk.xml", "rtk.json", "leap.npz", "tigre.npz", "cil.npz", "cera.config",
-        "cera_projtable.txt", "openct.json", "ctsimu.json", "pyronn.npz",
+        "manifest.json",
+        "astra.npy",
+        "rtk.xml",
+        "rtk.json",
+        "leap.npz",
+        "tigre.npz",
+        "cil.npz",
+        "cera.config",
+        "cera_projtable.txt",
+        "openct.json",
+        "ctsimu.json",
+        "pyronn.npz",
     }
     content = manifest(tmp_path / "out")
     assert content["schema"] == "tomopose/exports/1"
@@ -137,8 +147,9 @@ def test_one_format_may_be_named_alone(tmp_path):
 
 def test_cera_follows_the_order_of_the_image_files(tmp_path):
     """FlipV says how the files lie on disk, which the scanner knows; the matrices are the same either way."""
-    scanner = Scanner(d_SD=1200, d_SR=310, p_u=0.2, p_v=0.25, u_0=150, v_0=128, n_u=301, n_v=257,
-                      image_rows="bottom-first")
+    scanner = Scanner(
+        d_SD=1200, d_SR=310, p_u=0.2, p_v=0.25, u_0=150, v_0=128, n_u=301, n_v=257, image_rows="bottom-first"
+    )
     matrices = replace(random_matrices(20), scanner=scanner)
     export(matrices, tmp_path / "out", formats=["cera"], rows="top")
     assert manifest(tmp_path / "out")["formats"]["cera"]["row0"] == "bottom"

@@ -74,9 +74,7 @@ def test_millimetres_to_metres_leave_the_pixels(scanner, T_HT, rng):
     poses = PoseSequence.from_table(rng.uniform(-9, 9, (3, 3)), rng.uniform(-5, 5, (3, 3)))
     t = rng.uniform(-5, 5, 3)
     k = 1e-3
-    small = replace(
-        scanner, d_SD=scanner.d_SD * k, d_SR=scanner.d_SR * k, p_u=scanner.p_u * k, p_v=scanner.p_v * k
-    )
+    small = replace(scanner, d_SD=scanner.d_SD * k, d_SR=scanner.d_SR * k, p_u=scanner.p_u * k, p_v=scanner.p_v * k)
     assert_allclose(
         project_ball(small, T_HT=replace(T_HT, t=T_HT.t * k), T_MH=replace(poses.T_MH, t=poses.T_MH.t * k), t=t * k),
         project_ball(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=t),

@@ -54,8 +54,9 @@ def test_colour_and_alpha_are_refused(tmp_path, samples):
 
 
 def test_palettes_are_refused(tmp_path):
-    tifffile.imwrite(tmp_path / "p.tif", np.zeros(SHAPE, np.uint8), photometric="palette",
-                     colormap=np.zeros((3, 256), np.uint16))
+    tifffile.imwrite(
+        tmp_path / "p.tif", np.zeros(SHAPE, np.uint8), photometric="palette", colormap=np.zeros((3, 256), np.uint16)
+    )
     with pytest.raises(InputError, match="is a colour image"):
         open_images(tmp_path)
 

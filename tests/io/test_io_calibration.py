@@ -20,9 +20,28 @@ from tomopose.trajectory.pose_grid import pose_grid
 
 KEPT = Path(__file__).parent / "files"
 INTERFACE = {
-    "schema", "T_HT", "t_mm", "ball_ids", "parameters", "covariance", "d_rms_px", "d_rms_um", "dof", "chi2_dof",
-    "model", "manipulator", "observability", "hypotheses", "verdict", "reasons", "pivot_mm", "scanner", "residuals",
-    "outliers", "status", "provenance",
+    "schema",
+    "T_HT",
+    "t_mm",
+    "ball_ids",
+    "parameters",
+    "covariance",
+    "d_rms_px",
+    "d_rms_um",
+    "dof",
+    "chi2_dof",
+    "model",
+    "manipulator",
+    "observability",
+    "hypotheses",
+    "verdict",
+    "reasons",
+    "pivot_mm",
+    "scanner",
+    "residuals",
+    "outliers",
+    "status",
+    "provenance",
 }
 
 
@@ -33,20 +52,33 @@ def cal(scanner, T_HT, rng) -> Calibration:
     covariance[7] = np.nan
     covariance[7, 7] = np.inf
     return Calibration(
-        scanner=replace(scanner, eta=0.001, sigma={"u_0": 0.3}), T_HT=T_HT,
-        balls={0: rng.normal(size=3), 3: rng.normal(size=3)}, tangent=names, covariance=covariance,
-        pose_id=tuple(f"p{k}" for k in range(n)), x_D=rng.normal(size=(n, 2)) * 300,
-        residuals=rng.normal(size=(n, 2)) / 100, chi2=1 / 3, dof=5,
+        scanner=replace(scanner, eta=0.001, sigma={"u_0": 0.3}),
+        T_HT=T_HT,
+        balls={0: rng.normal(size=3), 3: rng.normal(size=3)},
+        tangent=names,
+        covariance=covariance,
+        pose_id=tuple(f"p{k}" for k in range(n)),
+        x_D=rng.normal(size=(n, 2)) * 300,
+        residuals=rng.normal(size=(n, 2)) / 100,
+        chi2=1 / 3,
+        dof=5,
         parameters=(
             Parameter(name="t_HT_x", value=2 / 3, u=1e-3 / 7, unit="mm"),
             Parameter(name="leg_1", value=-0.0, u=float("nan"), unit="um"),
             Parameter(name="d_SR", value=310.1, u=float("inf"), unit="mm"),
         ),
         observability=Observability(singular_values=np.array([3.0, 1 / 7, 0.0]), unobservable=("leg 1",), notes=("x",)),
-        outliers={"p9": "ball truncated"}, model="kinematic", manipulator={"leg_1": 0.1, "all": [1.5, 2.5]},
-        converged=False, status="stopped early", verdict="doubtful", reasons=("few poses", "no table angle"),
+        outliers={"p9": "ball truncated"},
+        model="kinematic",
+        manipulator={"leg_1": 0.1, "all": [1.5, 2.5]},
+        converged=False,
+        status="stopped early",
+        verdict="doubtful",
+        reasons=("few poses", "no table angle"),
         hypotheses=({"name": "as declared", "chi2_dof": 1.1}, {"name": "mirrored", "chi2_dof": 99.0}),
-        pivot=np.array([0.0, 0.1, 82.5]), convention="symetrie-hexapod", extra={"ball_diameter_mm": 8.0},
+        pivot=np.array([0.0, 0.1, 82.5]),
+        convention="symetrie-hexapod",
+        extra={"ball_diameter_mm": 8.0},
         provenance=Provenance(version="0.1.0", dependencies={"numpy": "2"}, inputs={"a": "b"}, seed=3),
     )
 
@@ -150,8 +182,13 @@ def test_nothing_is_overwritten_without_force(tmp_path, cal):
 def matrices(scanner, T_HT, rng) -> ProjectionMatrices:
     poses = pose_grid(2)
     return ProjectionMatrices(
-        P=eq5_matrices(scanner, T_HT=T_HT, T_MH=poses.T_MH), n_u=scanner.n_u, n_v=scanner.n_v, p_u=scanner.p_u,
-        p_v=scanner.p_v, pose_id=tuple(f"ö{k}" for k in range(len(poses))), scanner=scanner,
+        P=eq5_matrices(scanner, T_HT=T_HT, T_MH=poses.T_MH),
+        n_u=scanner.n_u,
+        n_v=scanner.n_v,
+        p_u=scanner.p_u,
+        p_v=scanner.p_v,
+        pose_id=tuple(f"ö{k}" for k in range(len(poses))),
+        scanner=scanner,
         points_sigma=rng.random((len(poses), 5)),
     )
 

@@ -88,8 +88,11 @@ def test_a_recording_is_a_table(log):
 
 
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(st.tuples(*[st.floats(-50, 50).map(lambda x: x + 100)] * 3, *[st.floats(1, 30)] * 3), min_size=1,
-                max_size=5))
+@given(
+    st.lists(
+        st.tuples(*[st.floats(-50, 50).map(lambda x: x + 100)] * 3, *[st.floats(1, 30)] * 3), min_size=1, max_size=5
+    )
+)
 def test_every_digit_of_a_reply_counts(tmp_path, rows):
     axes = "XYZUVW"
     path = tmp_path / "hexapod.log"

@@ -77,11 +77,24 @@ def test_a_pattern_a_list_and_one_file_are_read(folder, stack):
     check(open_images(folder / "pose_4.tif"), stack[4:5])
 
 
-@pytest.mark.parametrize("options", [
-    {}, {"byteorder": ">"}, {"bigtiff": True}, {"compression": "zlib"}, {"compression": "zlib", "predictor": True},
-    {"compression": "lzw"}, {"rowsperstrip": 5}, {"tile": (16, 32)}, {"tile": (16, 16), "compression": "zlib"},
-    {"rowsperstrip": 7, "compression": "zlib"}, {"imagej": True}, {"compression": "packbits"}, {"compression": "zstd"},
-])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"byteorder": ">"},
+        {"bigtiff": True},
+        {"compression": "zlib"},
+        {"compression": "zlib", "predictor": True},
+        {"compression": "lzw"},
+        {"rowsperstrip": 5},
+        {"tile": (16, 32)},
+        {"tile": (16, 16), "compression": "zlib"},
+        {"rowsperstrip": 7, "compression": "zlib"},
+        {"imagej": True},
+        {"compression": "packbits"},
+        {"compression": "zstd"},
+    ],
+)
 @pytest.mark.parametrize("single", [True, False])
 def test_every_lossless_tiff_is_read_alike(tmp_path, stack, options, single):
     if options.get("imagej") and single:

@@ -53,10 +53,17 @@ def test_everything_comes_back_bit_for_bit(tmp_path, rng):
     seen = rng.random(n) > 0.3
     x_D = np.where(seen[:, None], rng.normal(size=(n, 2)) * 500, np.nan)
     obs = BallObservations(
-        x_D=x_D, covariance=A @ A.swapaxes(1, 2) + 1e-6 * np.eye(2), pose_id=tuple(f"p{k}" for k in range(n)),
-        seen=seen, status=tuple("ok" if s else "truncated, left" for s in seen),
-        image=tuple(f"im {k}.tif" for k in range(n)), snr=np.where(seen, rng.random(n), np.nan),
-        semi_major=rng.random(n), semi_minor=rng.random(n), angle=rng.random(n), x_ellipse=x_D + 0.01,
+        x_D=x_D,
+        covariance=A @ A.swapaxes(1, 2) + 1e-6 * np.eye(2),
+        pose_id=tuple(f"p{k}" for k in range(n)),
+        seen=seen,
+        status=tuple("ok" if s else "truncated, left" for s in seen),
+        image=tuple(f"im {k}.tif" for k in range(n)),
+        snr=np.where(seen, rng.random(n), np.nan),
+        semi_major=rng.random(n),
+        semi_minor=rng.random(n),
+        angle=rng.random(n),
+        x_ellipse=x_D + 0.01,
     )
     write_observations(tmp_path / "o.csv", obs)
     same(read_observations(tmp_path / "o.csv"), obs)
@@ -75,8 +82,13 @@ def test_a_variance_survives_being_written_as_a_sigma(variance):
 
 
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(st.tuples(st.floats(-9e3, 9e3), st.floats(-9e3, 9e3), st.floats(1e-4, 10), st.floats(-0.99, 0.99)),
-                min_size=1, max_size=5))
+@given(
+    st.lists(
+        st.tuples(st.floats(-9e3, 9e3), st.floats(-9e3, 9e3), st.floats(1e-4, 10), st.floats(-0.99, 0.99)),
+        min_size=1,
+        max_size=5,
+    )
+)
 def test_whatever_is_written_is_read(tmp_path, rows):
     r = np.array(rows)
     covariance = np.empty((len(r), 2, 2))

@@ -32,8 +32,9 @@ def table(tmp_path):
 
 
 def random_poses(rng: np.random.Generator, n: int = 5, **columns) -> PoseSequence:
-    T = RigidTransform(R=exp_rotation(rng.normal(size=(n, 3))), t=rng.normal(size=(n, 3)) * 20, source=Frame.M,
-                       target=Frame.H)
+    T = RigidTransform(
+        R=exp_rotation(rng.normal(size=(n, 3))), t=rng.normal(size=(n, 3)) * 20, source=Frame.M, target=Frame.H
+    )
     return PoseSequence(T_MH=T, pose_id=tuple(f"p{k}" for k in range(n)), **columns)
 
 
@@ -87,9 +88,15 @@ def test_all_columns_come_back(tmp_path, rng):
     near = random_poses(rng)
     shift = RigidTransform(R=near.T_MH.R, t=near.T_MH.t + 0.001, source=Frame.M, target=Frame.H)
     poses = PoseSequence(
-        T_MH=near.T_MH, pose_id=near.pose_id, alpha=np.linspace(0, 3, n), ball_id=[0, 1, 0, 2, 0],
-        image=tuple(f"a, b{k}.tif" for k in range(n)), time_utc=tuple(f"2026-01-0{k + 1}T00:00:00Z" for k in range(n)),
-        T_MH_set=shift, pivot=[0.1, -0.2, 30.0], q=np.outer(np.arange(n), np.ones(6)) / 7,
+        T_MH=near.T_MH,
+        pose_id=near.pose_id,
+        alpha=np.linspace(0, 3, n),
+        ball_id=[0, 1, 0, 2, 0],
+        image=tuple(f"a, b{k}.tif" for k in range(n)),
+        time_utc=tuple(f"2026-01-0{k + 1}T00:00:00Z" for k in range(n)),
+        T_MH_set=shift,
+        pivot=[0.1, -0.2, 30.0],
+        q=np.outer(np.arange(n), np.ones(6)) / 7,
     )
     write_poses(tmp_path / "poses.csv", poses, comments=[("operator", "none")])
     again = read_poses(tmp_path / "poses.csv")
@@ -102,7 +109,8 @@ def test_all_columns_come_back(tmp_path, rng):
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.lists(
-        st.tuples(*[st.floats(-300, 300)] * 3, *[st.floats(-1.5, 1.5)] * 3, st.floats(-400, 400)), min_size=1,
+        st.tuples(*[st.floats(-300, 300)] * 3, *[st.floats(-1.5, 1.5)] * 3, st.floats(-400, 400)),
+        min_size=1,
         max_size=6,
     )
 )
@@ -381,16 +389,12 @@ def test_bad_ball_ids_and_times_are_refused(table):
     with pytest.raises(InputError, match="'yesterday' is no ISO 8601 time"):
         read_poses(table(f"{HEAD},time_utc\n0,1,2,3,0,5,0,yesterday\n"))
     with pytest.raises(InputError, match="with and without a time zone"):
-        read_poses(
-            table(f"{HEAD},time_utc\n0,1,2,3,0,5,0,2026-01-01T00:00:00Z\n1,1,2,3,0,5,1,2026-01-01T00:00:01\n")
-        )
+        read_poses(table(f"{HEAD},time_utc\n0,1,2,3,0,5,0,2026-01-01T00:00:00Z\n1,1,2,3,0,5,1,2026-01-01T00:00:01\n"))
 
 
 def test_a_clock_that_runs_backwards_gives_a_warning(table):
     with pytest.warns(InputWarning, match="row 2 .* the clock runs backwards"):
-        read_poses(
-            table(f"{HEAD},time_utc\n0,1,2,3,0,5,0,2026-01-01T00:00:01Z\n1,1,2,3,0,5,1,2026-01-01T00:00:00Z\n")
-        )
+        read_poses(table(f"{HEAD},time_utc\n0,1,2,3,0,5,0,2026-01-01T00:00:01Z\n1,1,2,3,0,5,1,2026-01-01T00:00:00Z\n"))
 
 
 def test_files_that_are_no_tables_are_refused(table, tmp_path):

@@ -14,8 +14,15 @@ from tomopose.io import read_scanner, write_scanner
 from tomopose.io.scanner_json import KNOWN, scanner_document, scanner_schema
 
 GOOD = {
-    "schema": "tomopose/scanner/1", "d_SD_mm": 1500, "d_SR_mm": 283.5, "p_u_mm": 0.2, "p_v_mm": 0.25,
-    "u_0_px": 1021.37, "v_0_px": 1026.81, "n_u_px": 2048, "n_v_px": 2047,
+    "schema": "tomopose/scanner/1",
+    "d_SD_mm": 1500,
+    "d_SR_mm": 283.5,
+    "p_u_mm": 0.2,
+    "p_v_mm": 0.25,
+    "u_0_px": 1021.37,
+    "v_0_px": 1026.81,
+    "n_u_px": 2048,
+    "n_v_px": 2047,
 }
 
 
@@ -33,7 +40,14 @@ def file(tmp_path):
 def test_the_documented_file_is_read(file):
     s = read_scanner(file())
     assert (s.d_SD, s.d_SR, s.p_u, s.p_v, s.u_0, s.v_0, s.n_u, s.n_v) == (
-        1500, 283.5, 0.2, 0.25, 1021.37, 1026.81, 2048, 2047
+        1500,
+        283.5,
+        0.2,
+        0.25,
+        1021.37,
+        1026.81,
+        2048,
+        2047,
     )
     assert s.image_rows == "top-first"
 
@@ -45,12 +59,24 @@ def test_the_third_party_file_is_read(shared_data):
 @settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.builds(
-        Scanner, d_SD=st.floats(800, 2000), d_SR=st.floats(50, 700), p_u=st.floats(0.01, 1), p_v=st.floats(0.01, 1),
-        u_0=st.floats(-5000, 5000), v_0=st.floats(-5000, 5000), n_u=st.integers(1, 9000), n_v=st.integers(1, 9000),
-        eta=st.floats(-3, 3), theta=st.floats(-0.7, 0.7), phi=st.floats(-0.7, 0.7), axis_y=st.floats(-5, 5),
-        axis_tilt_x=st.floats(-0.1, 0.1), axis_tilt_y=st.floats(-0.1, 0.1),
+        Scanner,
+        d_SD=st.floats(800, 2000),
+        d_SR=st.floats(50, 700),
+        p_u=st.floats(0.01, 1),
+        p_v=st.floats(0.01, 1),
+        u_0=st.floats(-5000, 5000),
+        v_0=st.floats(-5000, 5000),
+        n_u=st.integers(1, 9000),
+        n_v=st.integers(1, 9000),
+        eta=st.floats(-3, 3),
+        theta=st.floats(-0.7, 0.7),
+        phi=st.floats(-0.7, 0.7),
+        axis_y=st.floats(-5, 5),
+        axis_tilt_x=st.floats(-0.1, 0.1),
+        axis_tilt_y=st.floats(-0.1, 0.1),
         sigma=st.dictionaries(st.sampled_from(["d_SD", "u_0", "eta"]), st.floats(1e-9, 10)),
-        image_rows=st.sampled_from(["top-first", "bottom-first"]), certificate=st.text(max_size=20),
+        image_rows=st.sampled_from(["top-first", "bottom-first"]),
+        certificate=st.text(max_size=20),
     )
 )
 def test_every_scanner_comes_back_bit_for_bit(tmp_path, scanner):
@@ -127,7 +153,7 @@ def test_metres_and_micrometres_are_asked_about(file, changes, message):
         ({"sigma": 3}, "sigma is no object"),
         ({"image_rows": "upside-down"}, "'top-first' or 'bottom-first' is needed"),
         ({"image_rows": 1}, "text is needed"),
-        ({"units": "mm"}, "only \"confirmed\" is known"),
+        ({"units": "mm"}, 'only "confirmed" is known'),
     ],
 )
 def test_impossible_values_are_named(file, changes, message):

@@ -23,8 +23,12 @@ def volume(rng):
     # a strided view, as reconstruction gives it
     values = rng.random((7, 4, 5)).astype(np.float32).transpose(2, 1, 0)
     return Volume(
-        values=values, grid=grid, view_residual=np.array([0.01, 0.02]), notes=("short scan",),
-        settings={"algorithm": "sart"}, provenance=provenance(arguments={"a": 1}, seed=3),
+        values=values,
+        grid=grid,
+        view_residual=np.array([0.01, 0.02]),
+        notes=("short scan",),
+        settings={"algorithm": "sart"},
+        provenance=provenance(arguments={"a": 1}, seed=3),
     )
 
 

@@ -100,9 +100,9 @@ def test_run_effects_jacobian(which: str, rng: np.random.Generator) -> None:
 @pytest.mark.parametrize("which", ["hexapod", "robot", "robot cartesian", "map", "inverse"])
 def test_commands_reach_the_wanted_poses(which: str, rng: np.random.Generator) -> None:
     wanted = robot_poses(rng) if which.startswith("robot") else hexapod_poses(rng)
-    machine: ErrorModel = {
-        "hexapod": HEXAPOD, "map": PoseMap(), "inverse": InverseManipulator(machine=HEXAPOD)
-    }.get(which, ROBOT)
+    machine: ErrorModel = {"hexapod": HEXAPOD, "map": PoseMap(), "inverse": InverseManipulator(machine=HEXAPOD)}.get(
+        which, ROBOT
+    )
     if which == "robot cartesian":
         wanted = replace(wanted, q=None)
     block = block_of(machine, rng, wanted)

@@ -87,8 +87,13 @@ def test_jacobian_is_exact(rng: np.random.Generator) -> None:
 def test_turned_axes_turn_elsewhere_but_shift_as_told() -> None:
     """Turning axes rotated by 2.6 mrad about z against the shifting axes, field observation on a real hexapod."""
     machine = Hexapod(
-        base_joints=typical_hexapod().base_joints, platform_joints=typical_hexapod().platform_joints, joint_sigma=0.0,
-        leg_sigma=0.0, scale_sigma=0.0, geometry_sigma=0.0, axes_sigma=1e-3,
+        base_joints=typical_hexapod().base_joints,
+        platform_joints=typical_hexapod().platform_joints,
+        joint_sigma=0.0,
+        leg_sigma=0.0,
+        scale_sigma=0.0,
+        geometry_sigma=0.0,
+        axes_sigma=1e-3,
     )
     c = np.array([0.0, 0.0, 2.6e-3])
     poses = PoseSequence.from_table([[4.0, -3.0, 2.0], [0, 0, 0]], [[0, 0, 0], [0, 5.0, 0]])

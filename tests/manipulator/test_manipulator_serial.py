@@ -40,8 +40,12 @@ def test_modified_form_holds_the_same_arm(rng: np.random.Generator) -> None:
     modified = SerialRobot(
         joints=tuple(replace(j, a=a[k], alpha=alpha[k]) for k, j in enumerate(robot.joints)),
         convention="modified-dh",
-        tool=RigidTransform(R=R_x(alpha[-1]), t=[a[-1], 0, 0], source=robot.forward(robot.q_start[None]).source,
-                            target=robot.forward(robot.q_start[None]).source).matrix,
+        tool=RigidTransform(
+            R=R_x(alpha[-1]),
+            t=[a[-1], 0, 0],
+            source=robot.forward(robot.q_start[None]).source,
+            target=robot.forward(robot.q_start[None]).source,
+        ).matrix,
     )
     q = some_joints(robot, rng)
     np.testing.assert_allclose(modified.forward(q).matrix, robot.forward(q).matrix, atol=1e-9)

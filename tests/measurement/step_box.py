@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-FACES = (((0, 1, 3, 2), (-1, 0, 0), (0, 1, 0)), ((4, 6, 7, 5), (1, 0, 0), (0, 1, 0)),
-         ((0, 4, 5, 1), (0, -1, 0), (1, 0, 0)), ((2, 3, 7, 6), (0, 1, 0), (1, 0, 0)),
-         ((0, 2, 6, 4), (0, 0, -1), (1, 0, 0)), ((1, 5, 7, 3), (0, 0, 1), (1, 0, 0)))
+FACES = (
+    ((0, 1, 3, 2), (-1, 0, 0), (0, 1, 0)),
+    ((4, 6, 7, 5), (1, 0, 0), (0, 1, 0)),
+    ((0, 4, 5, 1), (0, -1, 0), (1, 0, 0)),
+    ((2, 3, 7, 6), (0, 1, 0), (1, 0, 0)),
+    ((0, 2, 6, 4), (0, 0, -1), (1, 0, 0)),
+    ((1, 5, 7, 3), (0, 0, 1), (1, 0, 0)),
+)
 """Corners in their order seen from outside, normal, a direction in the face."""
 
 
@@ -62,8 +67,9 @@ def step_box(size, prefix=".MILLI."):
         f"(GEOMETRIC_REPRESENTATION_CONTEXT(3)GLOBAL_UNCERTAINTY_ASSIGNED_CONTEXT(({close}))"
         f"GLOBAL_UNIT_ASSIGNED_CONTEXT(({mm},{rad},{sr}))REPRESENTATION_CONTEXT('',''))"
     )
-    shape = e.add(f"ADVANCED_BREP_SHAPE_REPRESENTATION('',({e.placement((0, 0, 0), (0, 0, 1), (1, 0, 0))},{solid}),"
-                  f"{context})")
+    shape = e.add(
+        f"ADVANCED_BREP_SHAPE_REPRESENTATION('',({e.placement((0, 0, 0), (0, 0, 1), (1, 0, 0))},{solid}),{context})"
+    )
     design = e.add("APPLICATION_CONTEXT('automotive design')")
     e.add(f"APPLICATION_PROTOCOL_DEFINITION('international standard','automotive_design',2000,{design})")
     part = e.add(f"PRODUCT_CONTEXT('',{design},'mechanical')")
@@ -73,6 +79,8 @@ def step_box(size, prefix=".MILLI."):
     definition = e.add(f"PRODUCT_DEFINITION('design','',{formation},{stage})")
     of_product = e.add(f"PRODUCT_DEFINITION_SHAPE('','',{definition})")
     e.add(f"SHAPE_DEFINITION_REPRESENTATION({of_product},{shape})")
-    head = ("ISO-10303-21;\nHEADER;\nFILE_DESCRIPTION((''),'2;1');\nFILE_NAME('','',(''),(''),'','','');\n"
-            "FILE_SCHEMA(('AUTOMOTIVE_DESIGN { 1 0 10303 214 1 1 1 1 }'));\nENDSEC;\nDATA;\n")
+    head = (
+        "ISO-10303-21;\nHEADER;\nFILE_DESCRIPTION((''),'2;1');\nFILE_NAME('','',(''),(''),'','','');\n"
+        "FILE_SCHEMA(('AUTOMOTIVE_DESIGN { 1 0 10303 214 1 1 1 1 }'));\nENDSEC;\nDATA;\n"
+    )
     return head + "\n".join(f"#{k}={r};" for k, r in enumerate(e.rows, 1)) + "\nENDSEC;\nEND-ISO-10303-21;\n"

@@ -14,8 +14,9 @@ from tomopose.measurement.uncertainty import Simulated
 
 
 def result(u=0.002, dof=40.0, kind="distance"):
-    return MeasurementResult(name="L", kind=kind, value=10.0, u=u, dof=dof, unit="mm", method="", direction="",
-                             volume="a")
+    return MeasurementResult(
+        name="L", kind=kind, value=10.0, u=u, dof=dof, unit="mm", method="", direction="", volume="a"
+    )
 
 
 def repeat(s, n=5):
@@ -47,8 +48,9 @@ def test_the_calibration_adds_in_squares():
 
 
 def test_a_simulation_stands_for_fit_and_calibration_and_corrects_the_value():
-    found = budget(result(), calibration=0.0015, simulated=drawn(0.004, 0.001, u_fit=0.002, dof_fit=800.0,
-                                                                 with_calibration=True))
+    found = budget(
+        result(), calibration=0.0015, simulated=drawn(0.004, 0.001, u_fit=0.002, dof_fit=800.0, with_calibration=True)
+    )
     assert found.u == pytest.approx(0.001 * math.sqrt(1 + 1 / 20))
     assert found.dof == 19
     assert (found.value, found.corrected) == (10.0, pytest.approx(9.996))

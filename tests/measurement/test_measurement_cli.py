@@ -58,10 +58,25 @@ def folder(tmp_path_factory):
 def measured(folder):
     """Two repeats and another trajectory, compared with the reference."""
     out = folder / "out"
-    volumes = [w for name, k in (("one", 1), ("two", 2), ("circular", 3))
-               for w in ("--volume", f"{name}={folder / f'scan{k}.h5'}")]
-    assert run(folder / "repeats.toml", *volumes, "--reference", folder / "part.stl", "--fit", "datum", "--out", out,
-               "--quiet") == 0
+    volumes = [
+        w
+        for name, k in (("one", 1), ("two", 2), ("circular", 3))
+        for w in ("--volume", f"{name}={folder / f'scan{k}.h5'}")
+    ]
+    assert (
+        run(
+            folder / "repeats.toml",
+            *volumes,
+            "--reference",
+            folder / "part.stl",
+            "--fit",
+            "datum",
+            "--out",
+            out,
+            "--quiet",
+        )
+        == 0
+    )
     return out
 
 
@@ -78,8 +93,17 @@ def test_the_summary(folder, capsys):
 
 def test_the_report_shows_groups_side_by_side_and_the_comparison(measured):
     page = (measured / "report.html").read_text(encoding="utf-8")
-    for words in ("Nominal-actual comparison: one", "Deviations in colour", "mesh3d", "Distances: groups side by side",
-                  "3D scan", "circular", "Repeats", "repeats.toml", "datum, 3-2-1"):
+    for words in (
+        "Nominal-actual comparison: one",
+        "Deviations in colour",
+        "mesh3d",
+        "Distances: groups side by side",
+        "3D scan",
+        "circular",
+        "Repeats",
+        "repeats.toml",
+        "datum, 3-2-1",
+    ):
         assert words in page
 
 
@@ -136,12 +160,33 @@ def test_the_picture_shows_the_part_in_the_colours_of_the_map(measured):
 def test_a_coarse_reference_is_refined_fitted_and_corrected(folder, between):
     """A reference of twelve triangles; a measuring machine found its top 10 um higher than nominal."""
     probed = [[x, y, HALF[2] + 0.010] for x in (-1.0, 0.0, 1.0) for y in (-0.8, 0.0, 0.8)]
-    (folder / "cmm.csv").write_text("x_mm,y_mm,z_mm\n" + "".join(f"{x},{y},{z}\n" for x, y, z in probed),
-                                    encoding="utf-8")
+    (folder / "cmm.csv").write_text(
+        "x_mm,y_mm,z_mm\n" + "".join(f"{x},{y},{z}\n" for x, y, z in probed), encoding="utf-8"
+    )
     out = folder / f"corrected {between}"
-    assert run(folder / "simple.toml", "--volume", folder / "scan1.h5", "--reference", folder / "coarse.stl",
-               "--edge-mm", "0.2", "--cmm-points", folder / "cmm.csv", "--cmm-interpolation", between, "--fit",
-               "best-fit", "--search-mm", "0.2", "--out", out, "--quiet") == 0
+    assert (
+        run(
+            folder / "simple.toml",
+            "--volume",
+            folder / "scan1.h5",
+            "--reference",
+            folder / "coarse.stl",
+            "--edge-mm",
+            "0.2",
+            "--cmm-points",
+            folder / "cmm.csv",
+            "--cmm-interpolation",
+            between,
+            "--fit",
+            "best-fit",
+            "--search-mm",
+            "0.2",
+            "--out",
+            out,
+            "--quiet",
+        )
+        == 0
+    )
     table = np.genfromtxt(out / "comparison.csv", delimiter=",", skip_header=1)
     x, d = table[:, :3] - CENTRE, table[:, 3]
     inner = (np.abs(x[:, 0]) < 1.2) & (np.abs(x[:, 1]) < 0.9)
@@ -173,10 +218,31 @@ def test_a_calibration_adds_its_share(folder):
     assert rows["L1"]["interval"] == "fit, calibration; without the systematic part"
     assert "Uncertainty" in (out / "report.html").read_text(encoding="utf-8")
     with pytest.raises(InputError, match="no volume is named"):
-        run(folder / "plan.toml", "--volume", folder / "scan1.h5", "--out", folder / "n", "--quiet",
-            "--calibration", f"other={folder / 'calibration.json'}", "--poses", folder / "scan.csv")
-    assert run(folder / "plan.toml", "--volume", folder / "scan1.h5", "--out", folder / "n", "--quiet",
-               "--poses", folder / "scan.csv") == 2
+        run(
+            folder / "plan.toml",
+            "--volume",
+            folder / "scan1.h5",
+            "--out",
+            folder / "n",
+            "--quiet",
+            "--calibration",
+            f"other={folder / 'calibration.json'}",
+            "--poses",
+            folder / "scan.csv",
+        )
+    assert (
+        run(
+            folder / "plan.toml",
+            "--volume",
+            folder / "scan1.h5",
+            "--out",
+            folder / "n",
+            "--quiet",
+            "--poses",
+            folder / "scan.csv",
+        )
+        == 2
+    )
 
 
 SCENE = """
@@ -211,12 +277,32 @@ tilt = "triangle"
 
 def test_virtual_scans_from_the_command_line(folder):
     (folder / "scene.toml").write_text(SCENE, encoding="utf-8")
-    plan = PLAN.replace("calibrated_mm = 3.84", "calibrated_mm = 3.84\nnominal_mm = 3.84").replace(
-        "[alignment]", "[surface]\nsearch_distance_mm = 0.5\n[alignment]").replace('kind = "datum"', 'kind = "none"')
+    plan = (
+        PLAN.replace("calibrated_mm = 3.84", "calibrated_mm = 3.84\nnominal_mm = 3.84")
+        .replace("[alignment]", "[surface]\nsearch_distance_mm = 0.5\n[alignment]")
+        .replace('kind = "datum"', 'kind = "none"')
+    )
     (folder / "nominal.toml").write_text(plan, encoding="utf-8")
     out = folder / "simulated"
-    assert run(folder / "nominal.toml", "--volume", folder / "scan1.h5", "--simulate", folder / "scene.toml",
-               "--draws", "3", "--seed", "4", "--simulate-voxel", "1.1", "--out", out, "--quiet") == 0
+    assert (
+        run(
+            folder / "nominal.toml",
+            "--volume",
+            folder / "scan1.h5",
+            "--simulate",
+            folder / "scene.toml",
+            "--draws",
+            "3",
+            "--seed",
+            "4",
+            "--simulate-voxel",
+            "1.1",
+            "--out",
+            out,
+            "--quiet",
+        )
+        == 0
+    )
     rows = {r["name"]: r for r in rows_of(out / "uncertainty.csv")}
     length = rows["L1"]
     assert float(length["simulation"]) > 0
@@ -227,7 +313,7 @@ def test_virtual_scans_from_the_command_line(folder):
     assert length["interval"] == "virtual scans; corrected by simulation"
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "corrected by simulation / mm" in page
-    assert f'{float(length["corrected"]):.5f}' in page
+    assert f"{float(length['corrected']):.5f}" in page
     assert f"{value:.5f}" in page
     document = json.loads((out / "measurement.json").read_text(encoding="utf-8"))
     assert document["simulated"]["L1"]["runs"] == 3
@@ -237,16 +323,28 @@ def test_virtual_scans_from_the_command_line(folder):
 class TestRefused:
     def test_two_volumes_of_one_name(self, folder):
         with pytest.raises(InputError, match="two volumes"):
-            run(folder / "plan.toml", "--volume", folder / "scan1.h5", "--volume", folder / "scan1.h5", "--out",
-                folder / "other")
+            run(
+                folder / "plan.toml",
+                "--volume",
+                folder / "scan1.h5",
+                "--volume",
+                folder / "scan1.h5",
+                "--out",
+                folder / "other",
+            )
 
     def test_a_missing_volume(self, folder):
         with pytest.raises(FileError, match="does not exist"):
             run(folder / "plan.toml", "--volume", folder / "none.h5", "--out", folder / "third")
 
-    @pytest.mark.parametrize(("file", "error", "words"), [("metres.stl", UnitError, "metres"),
-                                                          ("open.stl", InputError, "watertight"),
-                                                          ("coarse.stl", InputError, "smaller triangles")])
+    @pytest.mark.parametrize(
+        ("file", "error", "words"),
+        [
+            ("metres.stl", UnitError, "metres"),
+            ("open.stl", InputError, "watertight"),
+            ("coarse.stl", InputError, "smaller triangles"),
+        ],
+    )
     def test_a_reference_that_cannot_be_one(self, folder, file, error, words):
         out = folder / "refused"
         with pytest.raises(error, match=words):
@@ -255,8 +353,17 @@ class TestRefused:
 
     def test_datum_without_datums(self, folder):
         with pytest.raises(InputError, match="three datums"):
-            run(folder / "simple.toml", "--volume", folder / "scan1.h5", "--reference", folder / "part.stl", "--fit",
-                "datum", "--out", folder / "refused")
+            run(
+                folder / "simple.toml",
+                "--volume",
+                folder / "scan1.h5",
+                "--reference",
+                folder / "part.stl",
+                "--fit",
+                "datum",
+                "--out",
+                folder / "refused",
+            )
 
     @pytest.mark.parametrize("option", ["--fit", "--cmm-interpolation"])
     def test_an_unknown_choice(self, folder, option):

@@ -48,8 +48,10 @@ def block():
     """A blurred box that is 0.02 mm too long at +x."""
     grid = VoxelGrid(shape=(50, 42, 47), spacing=np.full(3, V))
     high = HALF + [0.02, 0, 0]
-    x, y, z = (ndtr((s + h) / SIGMA) - ndtr((s - g) / SIGMA) for s, h, g in
-               zip((grid.origin[a] + V * np.arange(grid.n_xyz[a]) for a in range(3)), HALF, high, strict=True))
+    x, y, z = (
+        ndtr((s + h) / SIGMA) - ndtr((s - g) / SIGMA)
+        for s, h, g in zip((grid.origin[a] + V * np.arange(grid.n_xyz[a]) for a in range(3)), HALF, high, strict=True)
+    )
     return as_volume(z[:, None, None] * y[None, :, None] * x[None, None, :], grid)
 
 

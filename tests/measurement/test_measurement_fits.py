@@ -101,8 +101,12 @@ def correlated_height(length, runs, rng, reach=2.0):
         moved[:, 2] += 0.01 * L @ rng.standard_normal(len(points))
         fits.append(fit_plane(moved, correlation_range=reach))
     height, u = np.array([f.point[2] for f in fits]), np.array([np.sqrt(f.covariance[2, 2]) for f in fits])
-    return (np.std(height) / np.sqrt(np.mean(u**2)), np.mean([f.n_effective for f in fits]),
-            len(points) ** 2 / C.sum(), fits)
+    return (
+        np.std(height) / np.sqrt(np.mean(u**2)),
+        np.mean([f.n_effective for f in fits]),
+        len(points) ** 2 / C.sum(),
+        fits,
+    )
 
 
 @pytest.mark.parametrize("length", [0.05, 0.4, 0.7])
@@ -174,8 +178,9 @@ def test_both_components_of_a_line_count():
     """A line's residuals are unsigned distances; its correlation is that of the two components across it."""
     rng = np.random.default_rng(8)
     t = np.linspace(0, 10, 400)
-    found = [fit_line(np.column_stack([0.01 * rng.standard_normal((400, 2)), t]), correlation_range=0.3)
-             for _ in range(30)]
+    found = [
+        fit_line(np.column_stack([0.01 * rng.standard_normal((400, 2)), t]), correlation_range=0.3) for _ in range(30)
+    ]
     assert np.mean([f.n_effective for f in found]) == pytest.approx(400, rel=0.25)
 
 

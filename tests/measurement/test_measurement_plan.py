@@ -92,8 +92,9 @@ of = ["top"]
 def block(noise=0.0, seed=0):
     grid = VoxelGrid(shape=(58, 52, 57), spacing=np.full(3, V))
     axes = [grid.origin[a] + V * np.arange(grid.n_xyz[a]) for a in range(3)]
-    x, y, z = (ndtr((s - c + h) / SIGMA) - ndtr((s - c - h) / SIGMA)
-               for s, c, h in zip(axes, CENTRE, HALF, strict=True))
+    x, y, z = (
+        ndtr((s - c + h) / SIGMA) - ndtr((s - c - h) / SIGMA) for s, c, h in zip(axes, CENTRE, HALF, strict=True)
+    )
     values = z[:, None, None] * y[None, :, None] * x[None, None, :]
     return as_volume(values + noise * np.random.default_rng(seed).standard_normal(grid.shape), grid)
 
@@ -190,17 +191,35 @@ def test_lines_and_circles_are_features_of_a_plan(document):
     slab = ndtr((z + 1.21) / SIGMA) - ndtr((z - 1.21) / SIGMA)
     values = slab * ndtr((np.hypot(x - 0.13, y + 0.07) - 0.7) / SIGMA)
     features = {
-        "bore": {"kind": "circle", "point": [0.1, -0.1, 0.2], "direction": [0, 0, 1], "radius_mm": 0.7, "inward": True,
-                 "n_points": 200},
-        "track": {"kind": "line", "point": [0, 1.5, 1.21], "direction": [1, 0, 0], "normal": [0, 0, 1],
-                  "length_mm": 3.0, "safety_mm": 0.2, "n_points": 100},
+        "bore": {
+            "kind": "circle",
+            "point": [0.1, -0.1, 0.2],
+            "direction": [0, 0, 1],
+            "radius_mm": 0.7,
+            "inward": True,
+            "n_points": 200,
+        },
+        "track": {
+            "kind": "line",
+            "point": [0, 1.5, 1.21],
+            "direction": [1, 0, 0],
+            "normal": [0, 0, 1],
+            "length_mm": 3.0,
+            "safety_mm": 0.2,
+            "n_points": 100,
+        },
     }
-    measurands = [{"name": "D", "kind": "diameter", "of": ["bore"]}, {"name": "X", "kind": "x", "of": ["bore"]},
-                  {"name": "Z", "kind": "z", "of": ["track"]},
-                  {"name": "straightness", "kind": "form", "of": ["track"]},
-                  {"name": "between", "kind": "distance", "of": ["bore", "track"]}]
-    found = measure(as_volume(values, grid), plan_from(
-        document | {"features": features, "measurands": measurands, "alignment": {"kind": "none"}}))
+    measurands = [
+        {"name": "D", "kind": "diameter", "of": ["bore"]},
+        {"name": "X", "kind": "x", "of": ["bore"]},
+        {"name": "Z", "kind": "z", "of": ["track"]},
+        {"name": "straightness", "kind": "form", "of": ["track"]},
+        {"name": "between", "kind": "distance", "of": ["bore", "track"]},
+    ]
+    found = measure(
+        as_volume(values, grid),
+        plan_from(document | {"features": features, "measurands": measurands, "alignment": {"kind": "none"}}),
+    )
     value = {r.name: r.value for r in found.results}
     assert value["D"] == pytest.approx(1.4, abs=2e-3)
     assert value["X"] == pytest.approx(0.13, abs=1e-4)
@@ -224,11 +243,21 @@ class TestDatums:
     def found(self, *datums):
         nominal = tuple(datum(*d) for d in datums)
         measured = tuple(
-            datum(kind, self.turn @ x + self.shift, None if n is None else self.turn @ n) for kind, x, n in datums)
+            datum(kind, self.turn @ x + self.shift, None if n is None else self.turn @ n) for kind, x, n in datums
+        )
         return from_datums(nominal, measured)
 
-    @pytest.mark.parametrize("names", [("plane", "side", "front"), ("plane", "bore", "pin"), ("plane", "rod", "ball"),
-                                       ("rod", "ball", "plane"), ("plane", "bore", "ball"), ("bore", "pin", "plane")])
+    @pytest.mark.parametrize(
+        "names",
+        [
+            ("plane", "side", "front"),
+            ("plane", "bore", "pin"),
+            ("plane", "rod", "ball"),
+            ("rod", "ball", "plane"),
+            ("plane", "bore", "ball"),
+            ("bore", "pin", "plane"),
+        ],
+    )
     def test_a_motion_is_found(self, names):
         alignment = self.found(*(getattr(self, n) for n in names))
         assert np.abs(alignment.R - self.turn).max() < 1e-12
@@ -283,14 +312,24 @@ class TestBadPlans:
             plan_from(document)
 
     def test_a_circle_is_probed(self, document):
-        document["features"]["c"] = {"kind": "circle", "point": [0, 0, 0], "direction": [0, 0, 1], "radius_mm": 1,
-                                     "source": "surface"}
+        document["features"]["c"] = {
+            "kind": "circle",
+            "point": [0, 0, 0],
+            "direction": [0, 0, 1],
+            "radius_mm": 1,
+            "source": "surface",
+        }
         with pytest.raises(InputError, match="probed"):
             plan_from(document)
 
     def test_a_line_whose_normal_runs_along_it(self, document):
-        document["features"]["l"] = {"kind": "line", "point": [0, 0, 1.92], "direction": [1, 0, 0], "length_mm": 2,
-                                     "normal": [2, 0, 0]}
+        document["features"]["l"] = {
+            "kind": "line",
+            "point": [0, 0, 1.92],
+            "direction": [1, 0, 0],
+            "length_mm": 2,
+            "normal": [2, 0, 0],
+        }
         with pytest.raises(InputError, match="runs along it"):
             measure(block(), plan_from(document))
 

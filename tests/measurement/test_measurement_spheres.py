@@ -53,11 +53,21 @@ def test_all_are_found_and_named(standard):
 
 
 def plan(calibrated, **changes):
-    return plan_from({
-        "schema": "tomopose/measurement-plan/1", "unit": "mm", "name": "standard",
-        "spheres": {"centres": calibrated.tolist(), "diameter_mm": DIAMETER, "safety_mm": 0.15, "tolerance_mm": 0.2,
-                    "mpe_distance": {"A_um": 9.0, "K": 50.0}, **changes},
-    })
+    return plan_from(
+        {
+            "schema": "tomopose/measurement-plan/1",
+            "unit": "mm",
+            "name": "standard",
+            "spheres": {
+                "centres": calibrated.tolist(),
+                "diameter_mm": DIAMETER,
+                "safety_mm": 0.15,
+                "tolerance_mm": 0.2,
+                "mpe_distance": {"A_um": 9.0, "K": 50.0},
+                **changes,
+            },
+        }
+    )
 
 
 def test_the_whole_standard(standard):

@@ -91,8 +91,10 @@ def test_shared_plateaus_scatter_less_than_a_fixed_level_where_grey_drifts(balls
         near = np.argmin(np.linalg.norm(found.points[:, None] - centres, axis=2), axis=1)
         return np.mean([fit_sphere(found.points[(near == k) & found.good]).form_95 for k in range(len(centres))])
 
-    fixed, own, shared = (form(surface(drifting, method=m, edges=e)) for m, e in (
-        ("iso-50", None), ("esf", EdgeSettings(plateau_radius=0.0)), ("esf", None)))
+    fixed, own, shared = (
+        form(surface(drifting, method=m, edges=e))
+        for m, e in (("iso-50", None), ("esf", EdgeSettings(plateau_radius=0.0)), ("esf", None))
+    )
     assert shared < 0.97 * fixed
     assert shared < 0.85 * own
 
@@ -313,8 +315,13 @@ class TestBadInput:
             probe(clean, np.zeros((3, 2)), np.zeros((3, 2)))
 
     def test_settings(self):
-        for bad in ({"search_distance": 0.0}, {"window": 0.5}, {"contrast_threshold": 1.0}, {"sigma": -1.0},
-                    {"plateau_radius": -1.0}):
+        for bad in (
+            {"search_distance": 0.0},
+            {"window": 0.5},
+            {"contrast_threshold": 1.0},
+            {"sigma": -1.0},
+            {"plateau_radius": -1.0},
+        ):
             with pytest.raises(InputError):
                 EdgeSettings(**bad)
 

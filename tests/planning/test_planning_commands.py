@@ -18,14 +18,19 @@ NUMBER = r"[-+]?\d+\.\d+"
 @pytest.fixture
 def poses(rng):
     return PoseSequence.from_table(
-        rng.uniform(-10, 10, (7, 3)), rng.uniform(-5, 5, (7, 3)), alpha=np.radians([0, 0, 90, 90, 90, 0, 0.0]),
-        pivot=[1.0, 2.0, 3.0], pose_id=[f"p{k}" for k in range(7)],
+        rng.uniform(-10, 10, (7, 3)),
+        rng.uniform(-5, 5, (7, 3)),
+        alpha=np.radians([0, 0, 90, 90, 90, 0, 0.0]),
+        pivot=[1.0, 2.0, 3.0],
+        pose_id=[f"p{k}" for k in range(7)],
     )
 
 
 MOVES = {
-    "pi-gcs": (r"^MOV X", "pi-hexapod", 1.0), "kuka-krl": (r"^LIN ", "kuka", 1.0),
-    "abb-rapid": (r"MoveL", "abb", 1.0), "ur-script": (r"movel\(", "ur", 1000.0),
+    "pi-gcs": (r"^MOV X", "pi-hexapod", 1.0),
+    "kuka-krl": (r"^LIN ", "kuka", 1.0),
+    "abb-rapid": (r"MoveL", "abb", 1.0),
+    "ur-script": (r"movel\(", "ur", 1000.0),
 }
 
 

@@ -40,7 +40,8 @@ def test_thirty_images_with_two_table_angles_match_the_paper_grid(turned_plan):
 def test_all_but_the_true_symmetries_are_resolved(turned_plan):
     assert turned_plan.resolved.unresolved == ()
     assert {h.name for h in turned_plan.resolved.symmetric} == {
-        "table zero", "image turned by 180 degrees and table sign",
+        "table zero",
+        "image turned by 180 degrees and table sign",
     }
 
 
@@ -48,7 +49,9 @@ def test_the_still_table_needs_at_most_72_and_says_what_stays_hidden(paper_scann
     plan = plan_poses(paper_scanner, t=BALL, n=72)
     assert plan.predicted <= plan.reference
     assert {h.name for h in plan.resolved.unresolved} == {
-        "half a pixel low", "half a pixel high", "pixels counted from 1",
+        "half a pixel low",
+        "half a pixel high",
+        "pixels counted from 1",
     }
     assert "another table angle" in plan.resolved.words[0]
     assert "half a pixel" in plan.resolved.words[0]

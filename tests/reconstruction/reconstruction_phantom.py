@@ -45,8 +45,16 @@ def tilt_eq11(alpha: np.ndarray) -> np.ndarray:
 
 
 def scan(
-    grid: VoxelGrid, *, n: int, n_u: int, n_v: int | None = None, tilted: bool = True, arc: float = 2 * np.pi,
-    aspect: float = 1.0, shift: tuple[float, float] = (0.3, -0.2), field: float | None = None,
+    grid: VoxelGrid,
+    *,
+    n: int,
+    n_u: int,
+    n_v: int | None = None,
+    tilted: bool = True,
+    arc: float = 2 * np.pi,
+    aspect: float = 1.0,
+    shift: tuple[float, float] = (0.3, -0.2),
+    field: float | None = None,
 ) -> ProjectionMatrices:
     """Matrices of a setup like the paper's, at magnification 5.
 
@@ -57,8 +65,14 @@ def scan(
     p_u = float(grid.spacing[0]) * 5.0 if field is None else edge * 5.0 * field / n_u
     n_v = n_u if n_v is None else n_v
     scanner = Scanner(
-        d_SD=1500.0, d_SR=300.0, p_u=p_u, p_v=p_u * aspect, u_0=(n_u - 1) / 2 + shift[0], v_0=(n_v - 1) / 2 + shift[1],
-        n_u=n_u, n_v=n_v,
+        d_SD=1500.0,
+        d_SR=300.0,
+        p_u=p_u,
+        p_v=p_u * aspect,
+        u_0=(n_u - 1) / 2 + shift[0],
+        v_0=(n_v - 1) / 2 + shift[1],
+        n_u=n_u,
+        n_v=n_v,
     )
     alpha = np.arange(n) * arc / n
     turn = R_z(alpha)
@@ -68,7 +82,12 @@ def scan(
     moved[:, :3, :3], moved[:, 3, 3] = turn, 1.0
     P = scanner.P_S @ (scanner.T_WS.matrix @ moved)
     return ProjectionMatrices(
-        P=P, n_u=n_u, n_v=n_v, p_u=scanner.p_u, p_v=scanner.p_v, pose_id=tuple(str(i) for i in range(n)),
+        P=P,
+        n_u=n_u,
+        n_v=n_v,
+        p_u=scanner.p_u,
+        p_v=scanner.p_v,
+        pose_id=tuple(str(i) for i in range(n)),
         scanner=scanner,
     )
 
@@ -192,6 +211,9 @@ def compare(values: np.ndarray, grid: VoxelGrid, objects: Balls, *, rays: int = 
         away &= np.linalg.norm(points - c, axis=-1) > r + 3 * voxel
     background = float(np.sqrt((values[::2, ::2, ::2][away] ** 2).mean()) / objects.mu[0])
     return Truth(
-        centre_error=np.array(centre_error), centroid_error=np.array(centroid_error),
-        radius_error=np.array(radius_error), inner=np.array(inner), background=background,
+        centre_error=np.array(centre_error),
+        centroid_error=np.array(centroid_error),
+        radius_error=np.array(radius_error),
+        inner=np.array(inner),
+        background=background,
     )

@@ -41,16 +41,19 @@ def test_slabs_on_disk_are_the_whole(settings, tmp_path):
 
 def test_memory_decides_on_slabs(tmp_path):
     big = VoxelGrid.cube(n=600, spacing=0.01)
-    plan = memory_plan(
-        MATRICES, big, subset_size=1, passes=2, memory_gib=0.7, most_voxels=2**31 - 1, may_cut=True
-    )
+    plan = memory_plan(MATRICES, big, subset_size=1, passes=2, memory_gib=0.7, most_voxels=2**31 - 1, may_cut=True)
     assert plan.in_one_piece > 0.7 * GIB
     thickest = -(-600 // plan.slabs)
     assert padded_bytes(big, thickest) + plan.images_bytes < 0.7 * GIB
     assert plan.disk_bytes > 2 * 36 * 4 * 600**3
     plan = memory_plan(
-        MATRICES, VoxelGrid.cube(n=2000, spacing=0.001), subset_size=10, passes=1, memory_gib=64.0,
-        most_voxels=2**31 - 1, may_cut=True,
+        MATRICES,
+        VoxelGrid.cube(n=2000, spacing=0.001),
+        subset_size=10,
+        passes=1,
+        memory_gib=64.0,
+        most_voxels=2**31 - 1,
+        may_cut=True,
     )
     assert plan.slabs > 1  # 32 GB fit, but not in one piece of 32 bit indices
 

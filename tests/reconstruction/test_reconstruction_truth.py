@@ -40,8 +40,14 @@ def truth_of(images, matrices, **settings):
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, PAPER, {"algorithm": "ossart", "iterations": 3}, {"algorithm": "sart", "order": "random"},
-                 {"nonnegative": True, "engine_options": {"kernels": "plain"}}],
+    "settings",
+    [
+        {},
+        PAPER,
+        {"algorithm": "ossart", "iterations": 3},
+        {"algorithm": "sart", "order": "random"},
+        {"nonnegative": True, "engine_options": {"kernels": "plain"}},
+    ],
     ids=["default", "paper", "ossart", "random order", "plain kernels"],
 )
 def test_ball_centres_on_a_tilted_path(tilted, settings):
@@ -203,8 +209,16 @@ def test_rtk_projectors_give_the_same_sart(tilted):
     matrices = tilted[0].select(range(0, 72, 3))
     images = tilted[1][::3]
     own, other = (
-        reconstruct(images, matrices, GRID, images_are="line-integrals", **{**PAPER, "order": "golden"}, engine=name,
-                    consistency="off", mask=inner)
+        reconstruct(
+            images,
+            matrices,
+            GRID,
+            images_are="line-integrals",
+            **{**PAPER, "order": "golden"},
+            engine=name,
+            consistency="off",
+            mask=inner,
+        )
         for name in ("cpu", "rtk")
     )
     span = float(np.ptp(other.values))

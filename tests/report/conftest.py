@@ -24,7 +24,9 @@ def grid_poses(turns_of_table: tuple[float, ...] = (0.0,)) -> PoseSequence:
     rotations = [np.zeros(3)] + [s * 5.0 * np.eye(3)[k] for k in range(3) for s in (1, -1)]
     rows = [((x, y, z), r, a) for a in turns_of_table for x in steps for y in steps for z in steps for r in rotations]
     return PoseSequence.from_table(
-        [p for p, _, _ in rows], np.array([r for _, r, _ in rows]), alpha=np.array([a for _, _, a in rows]),
+        [p for p, _, _ in rows],
+        np.array([r for _, r, _ in rows]),
+        alpha=np.array([a for _, _, a in rows]),
         pose_id=[f"p{k:03d}" for k in range(len(rows))],
     )
 
@@ -49,10 +51,16 @@ def sample() -> Callable[..., tuple[Calibration, BallObservations, PoseSequence]
         seen = np.ones(len(poses), dtype=bool)
         seen[-outliers:] = outliers == 0
         observations = BallObservations.from_sigma(
-            exact + noise, NOISE_PX, pose_id=poses.pose_id, seen=seen,
+            exact + noise,
+            NOISE_PX,
+            pose_id=poses.pose_id,
+            seen=seen,
             status=["ok" if s else "ball truncated by the image border" for s in seen],
-            snr=np.full(len(poses), 180.0), semi_major=np.full(len(poses), 108.0),
-            semi_minor=np.full(len(poses), 105.5), angle=np.zeros(len(poses)), x_ellipse=exact + noise + 0.05,
+            snr=np.full(len(poses), 180.0),
+            semi_major=np.full(len(poses), 108.0),
+            semi_minor=np.full(len(poses), 105.5),
+            angle=np.zeros(len(poses)),
+            x_ellipse=exact + noise + 0.05,
         )
         step = 1e-5
         J = np.stack(
@@ -82,19 +90,42 @@ def sample() -> Callable[..., tuple[Calibration, BallObservations, PoseSequence]
                 unobservable=() if len(turns) > 1 else ("t_HT,x and d_SR are exactly degenerate",),
                 notes=() if len(turns) > 1 else ("add poses at another table angle",),
             ),
-            outliers={p: "residual beyond what a clean run allows: 41.2 standard deviations"
-                      for p, s in zip(poses.pose_id, seen, strict=True) if not s},
+            outliers={
+                p: "residual beyond what a clean run allows: 41.2 standard deviations"
+                for p, s in zip(poses.pose_id, seen, strict=True)
+                if not s
+            },
             status="optimum reached",
             verdict=verdict,
             reasons=("the residuals are explained by the stated detection noise", "no rival convention fits as well"),
             hypotheses=(
-                {"name": "declared", "words": "the data as declared", "cure": "", "d_rms_px": 0.0283,
-                 "delta_chi2": 0.0, "outcome": "declared", "verdict": "as declared"},
-                {"name": "zyx", "words": "order R_z R_y R_x", "cure": "# convention: symetrie-hexapod",
-                 "d_rms_px": 0.0283, "delta_chi2": 0.4, "outcome": "same",
-                 "verdict": "cannot be told apart with these poses"},
-                {"name": "rows", "words": "image rows flipped", "cure": "image_rows: bottom-first", "d_rms_px": 4.61,
-                 "delta_chi2": 9.1e6, "outcome": "worse", "verdict": "excluded"},
+                {
+                    "name": "declared",
+                    "words": "the data as declared",
+                    "cure": "",
+                    "d_rms_px": 0.0283,
+                    "delta_chi2": 0.0,
+                    "outcome": "declared",
+                    "verdict": "as declared",
+                },
+                {
+                    "name": "zyx",
+                    "words": "order R_z R_y R_x",
+                    "cure": "# convention: symetrie-hexapod",
+                    "d_rms_px": 0.0283,
+                    "delta_chi2": 0.4,
+                    "outcome": "same",
+                    "verdict": "cannot be told apart with these poses",
+                },
+                {
+                    "name": "rows",
+                    "words": "image rows flipped",
+                    "cure": "image_rows: bottom-first",
+                    "d_rms_px": 4.61,
+                    "delta_chi2": 9.1e6,
+                    "outcome": "worse",
+                    "verdict": "excluded",
+                },
             ),
             pivot=np.array([0.0, 0.0, 200.0]),
             provenance=provenance(arguments={"model": "rigid"}, seed=20231028),

@@ -41,8 +41,13 @@ def test_matrices_mean_the_same_by_hand_and_through_a_file(tmp_path, capsys):
 def test_from_radiographs_to_geometry_files(tmp_path, capsys):
     setup = demo_setup(grid=2, small=True, views=36)
     run = tp.simulate_ball_run(
-        setup.scanner, T_HT=setup.T_HT, t=setup.t, poses=setup.poses, ball_diameter=setup.ball_diameter,
-        snr=setup.snr, seed=setup.seed,
+        setup.scanner,
+        T_HT=setup.T_HT,
+        t=setup.t,
+        poses=setup.poses,
+        ball_diameter=setup.ball_diameter,
+        snr=setup.snr,
+        seed=setup.seed,
     )
     write_run(tmp_path, run)
     tp.write_poses(tmp_path / "scan.csv", setup.scan)

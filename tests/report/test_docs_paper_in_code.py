@@ -13,9 +13,17 @@ WITHOUT_CODE = ("not implemented yet", "illustration only")
 
 EXPECTED = (
     *(f"Eq. ({k})" for k in range(1, 12)),
-    "Sec. 3, inverse of (1)", "Sec. 3, T_TW", "Sec. 3, scan angles", "Sec. 3, initial state",
-    "Sec. 4, parameter vector", "Sec. 6.1, sine tilt",
-    "Appendix, R_x", "Appendix, R_y", "Appendix, R_z", "Appendix, R", "Appendix, angles",
+    "Sec. 3, inverse of (1)",
+    "Sec. 3, T_TW",
+    "Sec. 3, scan angles",
+    "Sec. 3, initial state",
+    "Sec. 4, parameter vector",
+    "Sec. 6.1, sine tilt",
+    "Appendix, R_x",
+    "Appendix, R_y",
+    "Appendix, R_z",
+    "Appendix, R",
+    "Appendix, angles",
     *(f"Table {k}" for k in range(1, 4)),
     *(f"Fig. {k}" for k in range(1, 17)),
 )

@@ -40,13 +40,28 @@ def visit(chromium: str, page: Path, folder: Path) -> tuple[str, list[str], list
     log = folder / "net.json"
     result = subprocess.run(
         [
-            chromium, "--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader",
-            "--disable-background-networking", "--disable-component-update", "--no-first-run", "--disable-sync",
-            "--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={folder / 'profile'}", f"--log-net-log={log}",
-            "--window-size=1400,6000", "--virtual-time-budget=20000", "--enable-logging=stderr", "--dump-dom",
+            chromium,
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--enable-unsafe-swiftshader",
+            "--disable-background-networking",
+            "--disable-component-update",
+            "--no-first-run",
+            "--disable-sync",
+            "--host-resolver-rules=MAP * ~NOTFOUND",
+            f"--user-data-dir={folder / 'profile'}",
+            f"--log-net-log={log}",
+            "--window-size=1400,6000",
+            "--virtual-time-budget=20000",
+            "--enable-logging=stderr",
+            "--dump-dom",
             page.as_uri(),
         ],
-        capture_output=True, text=True, timeout=180, check=True,
+        capture_output=True,
+        text=True,
+        timeout=180,
+        check=True,
     )
     console = [
         line for line in re.findall(r'CONSOLE:\d+\] "(.*?)", source', result.stderr) if not line.startswith(HARMLESS)
@@ -89,7 +104,8 @@ def test_a_bare_report_is_drawn(chromium, sample, tmp_path):
 def test_the_other_reports_are_drawn(chromium, sample, scan, tmp_path):
     _, observations, _ = sample()
     for name, html, flat, space in (
-        ("observations", observations_report(observations), 2, 0), ("matrices", matrices_report(scan), 2, 1),
+        ("observations", observations_report(observations), 2, 0),
+        ("matrices", matrices_report(scan), 2, 1),
     ):
         folder = tmp_path / name
         folder.mkdir()

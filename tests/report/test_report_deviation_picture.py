@@ -83,8 +83,15 @@ def test_the_figure_holds_a_picture_a_panel_and_is_drawn(tmp_path):
     from matplotlib import image
 
     figure = deviation_figure(
-        {"one": np.full(8, -20.0), "two": np.full(8, 20.0)}, POINTS, FACES, NORMALS, range_um=20.0, title="t",
-        meaning="m", look_for="l", elevation_deg=90.0,
+        {"one": np.full(8, -20.0), "two": np.full(8, 20.0)},
+        POINTS,
+        FACES,
+        NORMALS,
+        range_um=20.0,
+        title="t",
+        meaning="m",
+        look_for="l",
+        elevation_deg=90.0,
     )
     assert len(figure.layout["images"]) == 2
     assert base64.b64decode(figure.layout["images"][0]["source"].split(",")[1]).startswith(b"\x89PNG")
@@ -102,10 +109,20 @@ def test_the_figure_holds_a_picture_a_panel_and_is_drawn(tmp_path):
 def test_a_heatmap_takes_its_own_colours_and_leaves_holes(tmp_path):
     from matplotlib import image
 
-    trace = {"type": "heatmap", "x": [0, 1, 2], "y": [0, 1], "z": [[0, 0, 0], [0, None, 0]], "zmin": -1, "zmax": 0,
-             "colorscale": [[0.0, "#000000"], [1.0, "rgb(200,0,0)"]], "showscale": False}
-    figure_png(tmp_path / "x.png", Figure(title="", meaning="", look_for="", data=[trace],
-                                          layout=layout(xaxis=axis(), yaxis=axis())))
+    trace = {
+        "type": "heatmap",
+        "x": [0, 1, 2],
+        "y": [0, 1],
+        "z": [[0, 0, 0], [0, None, 0]],
+        "zmin": -1,
+        "zmax": 0,
+        "colorscale": [[0.0, "#000000"], [1.0, "rgb(200,0,0)"]],
+        "showscale": False,
+    }
+    figure_png(
+        tmp_path / "x.png",
+        Figure(title="", meaning="", look_for="", data=[trace], layout=layout(xaxis=axis(), yaxis=axis())),
+    )
     found = np.round(255 * image.imread(tmp_path / "x.png")[..., :3]).astype(int).reshape(-1, 3)
     assert ((found == [200, 0, 0]).all(axis=1)).mean() > 0.3
     assert ((found == [255, 255, 255]).all(axis=1)).mean() > 0.15

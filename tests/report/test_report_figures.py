@@ -26,9 +26,9 @@ def decode_png(png: bytes) -> np.ndarray:
     assert png[:8] == b"\x89PNG\r\n\x1a\n"
     at, content, size = 8, b"", (0, 0)
     while at < len(png):
-        length = struct.unpack(">I", png[at:at + 4])[0]
-        kind, body = png[at + 4:at + 8], png[at + 8:at + 8 + length]
-        assert zlib.crc32(kind + body) == struct.unpack(">I", png[at + 8 + length:at + 12 + length])[0]
+        length = struct.unpack(">I", png[at : at + 4])[0]
+        kind, body = png[at + 4 : at + 8], png[at + 8 : at + 8 + length]
+        assert zlib.crc32(kind + body) == struct.unpack(">I", png[at + 8 + length : at + 12 + length])[0]
         if kind == b"IHDR":
             size = struct.unpack(">II", body[:8])
         if kind == b"IDAT":
@@ -218,8 +218,16 @@ def test_minutes_since_the_first_pose():
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0.0, "0"), (1.23456, "1.23"), (123456.7, "123457"), (0.00012345, "0.000123"), (9.1e6, "9.1e+06"),
-     (float("nan"), "not determinable"), (-42.55, "-42.5"), (1e-9, "1e-09")],
+    [
+        (0.0, "0"),
+        (1.23456, "1.23"),
+        (123456.7, "123457"),
+        (0.00012345, "0.000123"),
+        (9.1e6, "9.1e+06"),
+        (float("nan"), "not determinable"),
+        (-42.55, "-42.5"),
+        (1e-9, "1e-09"),
+    ],
 )
 def test_numbers_have_three_figures(value, text):
     assert number(value) == text

@@ -104,8 +104,8 @@ def test_numbers_in_the_page_are_those_of_the_calibration(full, sample):
     assert f"{phi.u * 1e6:.2f} µrad" in full
     assert f"{2 * phi.u * 1e6:.2f} µrad" in full
     for T in (calibration.T_HT, calibration.T_HT.inv):
-        assert f"<td class=\"n\">{T.R[0, 1]:.9f}</td>" in full
-        assert f"<td class=\"n\">{T.t[2]:.6f}</td>" in full
+        assert f'<td class="n">{T.R[0, 1]:.9f}</td>' in full
+        assert f'<td class="n">{T.t[2]:.6f}</td>' in full
     for pose in calibration.outliers:
         assert f"<td>{pose}</td>" in full
 
@@ -115,8 +115,14 @@ def test_a_bare_calibration_says_what_was_not_given(sample):
     bare = dataclasses.replace(calibration, provenance=None, hypotheses=(), pivot=None, outliers={}, reasons=())
     html = calibration_report(bare, observations=None, poses=None)
     for words in (
-        "Provenance: not given", "Hypotheses tried: not given", "not given (no pose table)", "not given (no scan)",
-        "Radiographs: not given", "Pivot of the controller: not given", "No image was set aside", "their own rms",
+        "Provenance: not given",
+        "Hypotheses tried: not given",
+        "not given (no pose table)",
+        "not given (no scan)",
+        "Radiographs: not given",
+        "Pivot of the controller: not given",
+        "No image was set aside",
+        "their own rms",
     ):
         assert words in html, words
     assert "t_HT,x and d_SR are exactly degenerate" in html
@@ -186,8 +192,11 @@ def test_the_same_values_give_the_same_page(sample):
 
 def test_extra_results_become_tables(sample):
     calibration, observations, poses = sample()
-    extra = {"models": [{"model": "rigid", "d_rms_px": 0.495}, {"model": "kinematic", "d_rms_px": 0.031}],
-             "cross_validation": {"folds": 5, "held_out_px": 0.0321}, "not_seen": {}}
+    extra = {
+        "models": [{"model": "rigid", "d_rms_px": 0.495}, {"model": "kinematic", "d_rms_px": 0.031}],
+        "cross_validation": {"folds": 5, "held_out_px": 0.0321},
+        "not_seen": {},
+    }
     html = calibration_report(dataclasses.replace(calibration, extra=extra), observations=observations, poses=poses)
     assert "Models and checks" in html
     assert "kinematic" in html

@@ -102,10 +102,15 @@ def test_kernels_attenuate_as_the_sum_does(rng):
 
 @pytest.mark.parametrize(
     "make",
-    [lambda: from_formula("Al(2)", 1.0), lambda: from_formula("al", 1.0), lambda: from_formula("Al", -1.0),
-     lambda: Material(density=1.0, fractions={"Al": 0.5}), lambda: attenuation("adamantium", [50.0]),
-     lambda: Spectrum(energy=np.array([1.0]), weight=np.array([0.0])),
-     lambda: tube_spectrum(120.0).filtered("Al", -1.0)],
+    [
+        lambda: from_formula("Al(2)", 1.0),
+        lambda: from_formula("al", 1.0),
+        lambda: from_formula("Al", -1.0),
+        lambda: Material(density=1.0, fractions={"Al": 0.5}),
+        lambda: attenuation("adamantium", [50.0]),
+        lambda: Spectrum(energy=np.array([1.0]), weight=np.array([0.0])),
+        lambda: tube_spectrum(120.0).filtered("Al", -1.0),
+    ],
 )
 def test_impossible_matter_is_refused(make):
     with pytest.raises(InputError):

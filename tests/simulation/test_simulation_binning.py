@@ -19,8 +19,16 @@ FINE = Scanner(d_SD=800.0, d_SR=200.0, p_u=0.4, p_v=0.5, u_0=60.3, v_0=57.1, n_u
 SCENE = {
     "schema": "tomopose/scene/1",
     "seed": 1,
-    "scanner": {"d_SD_mm": 800.0, "d_SR_mm": 200.0, "p_u_mm": 0.4, "p_v_mm": 0.5, "u_0_px": 60.3, "v_0_px": 57.1,
-                "n_u_px": 122, "n_v_px": 118},
+    "scanner": {
+        "d_SD_mm": 800.0,
+        "d_SR_mm": 200.0,
+        "p_u_mm": 0.4,
+        "p_v_mm": 0.5,
+        "u_0_px": 60.3,
+        "v_0_px": 57.1,
+        "n_u_px": 122,
+        "n_v_px": 118,
+    },
     "source": {"voltage_kV": 120.0},
     "detector": {"blur_sigma_px": 0.8, "cells": 3},
     "objects": [{"kind": "ball", "diameter_mm": 4.0}],
@@ -29,8 +37,9 @@ SCENE = {
 
 
 def scene(binning, **detector):
-    return scene_from({**SCENE, "scanner": {**SCENE["scanner"], "binning": binning},
-                       "detector": {**SCENE["detector"], **detector}})
+    return scene_from(
+        {**SCENE, "scanner": {**SCENE["scanner"], "binning": binning}, "detector": {**SCENE["detector"], **detector}}
+    )
 
 
 def test_the_binned_image_is_the_mean_of_the_detector_s_pixels():

@@ -24,8 +24,22 @@ pytest.importorskip("manifold3d")
 
 CUBE = Mesh(
     vertices=np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float),
-    faces=np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6],
-                    [0, 6, 4], [1, 5, 7], [1, 7, 3]]),
+    faces=np.array(
+        [
+            [0, 1, 3],
+            [0, 3, 2],
+            [4, 6, 7],
+            [4, 7, 5],
+            [0, 4, 5],
+            [0, 5, 1],
+            [2, 3, 7],
+            [2, 7, 6],
+            [0, 2, 6],
+            [0, 6, 4],
+            [1, 5, 7],
+            [1, 7, 3],
+        ]
+    ),
 )
 
 
@@ -78,8 +92,10 @@ def test_drawn_triangles_are_the_rays_paths(rng):
     u, v = np.meshgrid(window.u_0 + np.arange(81), window.v_0 + np.arange(70))
     d = (view.O + u[..., None] * view.U + v[..., None] * view.V - view.source).reshape(-1, 3)
     # Straight in the beam, the cube's sides meet the principal ray's row and column exactly.
-    for turn in (RigidTransform.from_angles([0.3, -0.5, 1.1], [1.0, 0.7, -0.4], source=Frame.M, target=Frame.W),
-                 RigidTransform.identity(Frame.M, Frame.W)):
+    for turn in (
+        RigidTransform.from_angles([0.3, -0.5, 1.1], [1.0, 0.7, -0.4], source=Frame.M, target=Frame.W),
+        RigidTransform.identity(Frame.M, Frame.W),
+    ):
         for mesh in (CUBE, ball(4)):
             solid = MeshSolid(mesh=mesh, material="Al")
             image = mesh_path_image((solid,), view, {Frame.M: turn}, window, threads=2)
@@ -104,8 +120,12 @@ def test_rays_through_corners_of_a_mesh_never_slip_through():
     walls = [[p, q, q + 81] for p, q in zip(rim, rim[1:] + rim[:1], strict=True)]
     walls += [[p, q + 81, p + 81] for p, q in zip(rim, rim[1:] + rim[:1], strict=True)]
     mesh = Mesh(vertices=np.concatenate([low, 1.25 * low]), faces=np.concatenate([near, near[:, ::-1] + 81, walls]))
-    image = mesh_path_image((MeshSolid(mesh=mesh, material="Al", frame=Frame.W),), view,
-                            {Frame.W: RigidTransform.identity(Frame.W)}, Window(u_0=0, v_0=0, n_u=9, n_v=9))
+    image = mesh_path_image(
+        (MeshSolid(mesh=mesh, material="Al", frame=Frame.W),),
+        view,
+        {Frame.W: RigidTransform.identity(Frame.W)},
+        Window(u_0=0, v_0=0, n_u=9, n_v=9),
+    )
     exact = 0.25 * np.linalg.norm(low, axis=1).reshape(9, 9)
     np.testing.assert_allclose(image[1:-1, 1:-1], exact[1:-1, 1:-1], rtol=1e-12)
     on_rim = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
@@ -116,8 +136,9 @@ def test_the_edge_of_a_mesh_lies_where_the_shape_s_does():
     scanner = Scanner(d_SD=800.0, d_SR=200.0, p_u=0.4, p_v=0.5, u_0=61.3, v_0=48.7, n_u=121, n_v=97)
     mount = RigidTransform.from_angles([0.1, 0.2, 3.0], [0.2, 0.1, 0.3], source=Frame.H, target=Frame.T)
     solids = (Solid(shape=box(7, 6, 5), material="WC-Co"),)
-    run = simulate_ball_run(scanner, T_HT=mount, t=np.zeros(3), poses=PoseSequence.from_table([[0, 0, 0]], [[0, 0, 0]]),
-                            solids=solids)
+    run = simulate_ball_run(
+        scanner, T_HT=mount, t=np.zeros(3), poses=PoseSequence.from_table([[0, 0, 0]], [[0, 0, 0]]), solids=solids
+    )
     ((mesh, material, frame),) = tessellate(solids)
     meshed = replace(run, solids=(), meshes=(MeshSolid(mesh=mesh, material=material, frame=frame),))
     a, b = transmission(run, 0), transmission(meshed, 0)

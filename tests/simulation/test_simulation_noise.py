@@ -95,8 +95,13 @@ def test_correction_removes_the_fixed_pattern():
 
 
 def test_saturation_depth_and_dead_pixels():
-    grey = expose(np.linspace(0, 1.4, 301)[None] * np.ones((257, 1)), Detector(snr=math.inf, saturation=50000.0), PANEL,
-                  seed=0, frame=0)
+    grey = expose(
+        np.linspace(0, 1.4, 301)[None] * np.ones((257, 1)),
+        Detector(snr=math.inf, saturation=50000.0),
+        PANEL,
+        seed=0,
+        frame=0,
+    )
     assert grey.max() == 50000
     grey = expose(np.ones(PANEL.shape), Detector(white=900.0, bits=10), PANEL, seed=0, frame=0)
     assert grey.max() <= 1023
@@ -105,8 +110,20 @@ def test_saturation_depth_and_dead_pixels():
 
 
 @pytest.mark.parametrize(
-    "values", [{"snr": 0.0}, {"snr": math.nan}, {"photons": -1.0}, {"blur_sigma": -0.1}, {"white": 7e4}, {"bits": 17},
-               {"lag": (0.6, 0.5)}, {"dead_share": 0.7}, {"output": "log"}, {"averages": 0}, {"cells": 40}],
+    "values",
+    [
+        {"snr": 0.0},
+        {"snr": math.nan},
+        {"photons": -1.0},
+        {"blur_sigma": -0.1},
+        {"white": 7e4},
+        {"bits": 17},
+        {"lag": (0.6, 0.5)},
+        {"dead_share": 0.7},
+        {"output": "log"},
+        {"averages": 0},
+        {"cells": 40},
+    ],
 )
 def test_impossible_detectors_are_refused(values):
     with pytest.raises(InputError):

@@ -33,8 +33,9 @@ CASES = {
     "bored block": (
         (box(6, 6, 6) - cylinder(2, -5, 5) - torus(3, 0.7)) | sphere(1),
         lambda x: (
-            (abs(x) < 3).all(-1) & (radial(x) >= 2) & ((radial(x) - 3) ** 2 + x[..., 2] ** 2 >= 0.49)
-        ) | ((x**2).sum(-1) < 1),
+            ((abs(x) < 3).all(-1) & (radial(x) >= 2) & ((radial(x) - 3) ** 2 + x[..., 2] ** 2 >= 0.49))
+            | ((x**2).sum(-1) < 1)
+        ),
     ),
 }
 
@@ -117,10 +118,19 @@ def test_too_many_crossings_are_an_error_and_no_wrong_path():
 
 
 @pytest.mark.parametrize(
-    "make", [lambda: sphere(0), lambda: cylinder(1, 2, 2), lambda: cone(-1, 1, 0, 1), lambda: box(1, -1, 1),
-             lambda: torus(1, 1), lambda: sphere(1).along([0, 0, 0]), lambda: union([]),
-             lambda: Solid(shape=half_space(), material="Al"),
-             lambda: Solid(shape=sphere(1), material="Al", frame=Frame.D), lambda: compile_solids([])],
+    "make",
+    [
+        lambda: sphere(0),
+        lambda: cylinder(1, 2, 2),
+        lambda: cone(-1, 1, 0, 1),
+        lambda: box(1, -1, 1),
+        lambda: torus(1, 1),
+        lambda: sphere(1).along([0, 0, 0]),
+        lambda: union([]),
+        lambda: Solid(shape=half_space(), material="Al"),
+        lambda: Solid(shape=sphere(1), material="Al", frame=Frame.D),
+        lambda: compile_solids([]),
+    ],
 )
 def test_impossible_shapes_are_refused(make):
     with pytest.raises(InputError):

@@ -20,8 +20,16 @@ SCENES = Path(__file__).resolve().parents[2] / "examples/scenes"
 MINIMAL = {
     "schema": "tomopose/scene/1",
     "seed": 1,
-    "scanner": {"d_SD_mm": 800.0, "d_SR_mm": 200.0, "p_u_mm": 0.8, "p_v_mm": 0.9, "u_0_px": 30.0, "v_0_px": 31.0,
-                "n_u_px": 61, "n_v_px": 63},
+    "scanner": {
+        "d_SD_mm": 800.0,
+        "d_SR_mm": 200.0,
+        "p_u_mm": 0.8,
+        "p_v_mm": 0.9,
+        "u_0_px": 30.0,
+        "v_0_px": 31.0,
+        "n_u_px": 61,
+        "n_v_px": 63,
+    },
     "source": {"voltage_kV": 120.0},
     "detector": {},
     "objects": [{"kind": "ball", "diameter_mm": 4.0}],
@@ -93,8 +101,18 @@ def test_the_published_schema_is_the_model_s():
         (changed(objects=[{"kind": "ball", "frame": "W"}]), "moves with the manipulator"),
         (changed(objects=[{"kind": "ball", "material": "wood"}]), "'wood' is unknown"),
         (changed(objects=[{"kind": "solid", "material": "Al", "shapes": [{"kind": "box"}]}]), "needs size_mm"),
-        (changed(objects=[{"kind": "solid", "material": "Al", "shapes": [{"kind": "sphere", "do": "subtract",
-                                                                          "radius_mm": 1.0}]}]), "cannot subtract"),
+        (
+            changed(
+                objects=[
+                    {
+                        "kind": "solid",
+                        "material": "Al",
+                        "shapes": [{"kind": "sphere", "do": "subtract", "radius_mm": 1.0}],
+                    }
+                ]
+            ),
+            "cannot subtract",
+        ),
         (changed(materials={"x": {"density_g_cm3": 1.0}}), "either formula or mass_fractions"),
         (changed(poses={"file": "poses.csv"}), "takes its poses from poses.csv"),
         (changed(scanner={**MINIMAL["scanner"], "d_SR_mm": 900.0}), "d_SR"),

@@ -17,11 +17,24 @@ from tomopose.simulation.scene.scene import scene_from
 SCENE = {
     "schema": "tomopose/scene/1",
     "seed": 6,
-    "scanner": {"d_SD_mm": 800.0, "d_SR_mm": 200.0, "p_u_mm": 0.8, "p_v_mm": 0.9, "u_0_px": 30.0, "v_0_px": 31.0,
-                "n_u_px": 61, "n_v_px": 63},
+    "scanner": {
+        "d_SD_mm": 800.0,
+        "d_SR_mm": 200.0,
+        "p_u_mm": 0.8,
+        "p_v_mm": 0.9,
+        "u_0_px": 30.0,
+        "v_0_px": 31.0,
+        "n_u_px": 61,
+        "n_v_px": 63,
+    },
     "source": {"voltage_kV": 120.0},
-    "detector": {"noise_sigma_px": 0.6, "readout_noise": 5.0, "dark": 200.0, "lag": [0.02],
-                 "scatter": {"constant": 0.01, "amount": 0.02, "sigma_px": 12.0}},
+    "detector": {
+        "noise_sigma_px": 0.6,
+        "readout_noise": 5.0,
+        "dark": 200.0,
+        "lag": [0.02],
+        "scatter": {"constant": 0.01, "amount": 0.02, "sigma_px": 12.0},
+    },
     "objects": [{"kind": "ball", "diameter_mm": 4.0}],
     "poses": {"scan": {"n": 5}},
 }

@@ -26,33 +26,54 @@ from tomopose.uncertainty.calibration_share import calibration_shares
 from tomopose.uncertainty.virtual_scans import drawn_matrices, simulated_errors, virtual_volumes
 
 BALLS, RADIUS = np.array([[-1.4, 0.2, 0.6], [1.3, -0.3, -0.5]]), 0.8
-SCANNER = {"d_SD_mm": 900.0, "d_SR_mm": 200.0, "p_u_mm": 0.6, "p_v_mm": 0.63, "u_0_px": 29.3, "v_0_px": 31.1,
-           "n_u_px": 60, "n_v_px": 63}
+SCANNER = {
+    "d_SD_mm": 900.0,
+    "d_SR_mm": 200.0,
+    "p_u_mm": 0.6,
+    "p_v_mm": 0.63,
+    "u_0_px": 29.3,
+    "v_0_px": 31.1,
+    "n_u_px": 60,
+    "n_v_px": 63,
+}
 VOXEL, SIZE = 0.16, 40
 
 
 def scene(snr):
     shapes = [{"kind": "sphere", "radius_mm": RADIUS, "t_mm": b.tolist()} for b in BALLS]
-    return scene_from({
-        "schema": "tomopose/scene/1", "seed": 4, "scanner": SCANNER,
-        "source": {"voltage_kV": 120.0, "filters": [{"material": "Cu", "thickness_mm": 2.0}]},
-        "detector": {"snr": snr, "blur_sigma_px": 0.5},
-        "objects": [{"kind": "solid", "material": "Al", "shapes": shapes}],
-        "mount": {"angles_deg": [0, 0, 0]}, "poses": {"scan": {"n": 48, "tilt": "triangle"}},
-    })
+    return scene_from(
+        {
+            "schema": "tomopose/scene/1",
+            "seed": 4,
+            "scanner": SCANNER,
+            "source": {"voltage_kV": 120.0, "filters": [{"material": "Cu", "thickness_mm": 2.0}]},
+            "detector": {"snr": snr, "blur_sigma_px": 0.5},
+            "objects": [{"kind": "solid", "material": "Al", "shapes": shapes}],
+            "mount": {"angles_deg": [0, 0, 0]},
+            "poses": {"scan": {"n": 48, "tilt": "triangle"}},
+        }
+    )
 
 
 def plan():
-    features = {f"ball {k}": {"kind": "sphere", "point": b.tolist(), "radius_mm": RADIUS, "n_points": 200}
-                for k, b in enumerate(BALLS)}
+    features = {
+        f"ball {k}": {"kind": "sphere", "point": b.tolist(), "radius_mm": RADIUS, "n_points": 200}
+        for k, b in enumerate(BALLS)
+    }
     length = float(np.linalg.norm(BALLS[1] - BALLS[0]))
-    return plan_from({
-        "schema": "tomopose/measurement-plan/1", "unit": "mm", "features": features,
-        "surface": {"search_distance_mm": 0.4},
-        "measurands": [{"name": "SD", "kind": "distance", "of": ["ball 0", "ball 1"], "nominal_mm": length},
-                       {"name": "D", "kind": "diameter", "of": ["ball 0"]},
-                       {"name": "form", "kind": "form_95", "of": ["ball 0"]}],
-    })
+    return plan_from(
+        {
+            "schema": "tomopose/measurement-plan/1",
+            "unit": "mm",
+            "features": features,
+            "surface": {"search_distance_mm": 0.4},
+            "measurands": [
+                {"name": "SD", "kind": "distance", "of": ["ball 0", "ball 1"], "nominal_mm": length},
+                {"name": "D", "kind": "diameter", "of": ["ball 0"]},
+                {"name": "form", "kind": "form_95", "of": ["ball 0"]},
+            ],
+        }
+    )
 
 
 @pytest.fixture(scope="module")
@@ -71,8 +92,9 @@ def calibration(run):
 
 
 def results(features):
-    return MeasurementResults(plan_name="", results=(), features={"scan": features},
-                              alignments={"scan": Alignment.none()})
+    return MeasurementResults(
+        plan_name="", results=(), features={"scan": features}, alignments={"scan": Alignment.none()}
+    )
 
 
 def test_a_distance_of_centres_has_the_share_that_theory_gives(run, calibration):
@@ -87,21 +109,31 @@ def test_a_distance_of_centres_has_the_share_that_theory_gives(run, calibration)
 def test_a_distance_of_planes_has_the_share_of_the_points_between_them(run, calibration):
     """Two small parallel planes: their distance is that of two points one above the other."""
     ends = np.array([[0.3, 0.2, -1.1], [0.3, 0.2, 1.2]])
-    document = {"schema": "tomopose/measurement-plan/1", "unit": "mm", "features": {}, "measurands": [
-        {"name": "L", "kind": "distance", "of": ["foot", "top"]}]}
+    document = {
+        "schema": "tomopose/measurement-plan/1",
+        "unit": "mm",
+        "features": {},
+        "measurands": [{"name": "L", "kind": "distance", "of": ["foot", "top"]}],
+    }
     features = {}
     for name, x, n in (("foot", ends[0], -1.0), ("top", ends[1], 1.0)):
         features[name] = fit_plane(plane_pattern(x, [0, 0, n], [0.2, 0, 0], [0, 0.2, 0], 49)[0])
-        document["features"][name] = {"kind": "plane", "point": x.tolist(), "direction": [0, 0, n], "u": [0.2, 0, 0],
-                                      "v": [0, 0.2, 0]}
+        document["features"][name] = {
+            "kind": "plane",
+            "point": x.tolist(),
+            "direction": [0, 0, n],
+            "u": [0.2, 0, 0],
+            "v": [0, 0.2, 0],
+        }
     found = calibration_shares(results(features), plan_from(document), "scan", calibration, run.poses)["L"]
     assert found == pytest.approx(float(length_sigma(calibration, run.poses, *ends)[0]), rel=0.05)
 
 
 def test_virtual_scans_with_drawn_calibrations_scatter_as_the_covariance_says(run, calibration):
     """No noise: only the calibration that is believed differs between the scans, here with d_SR uncertain too."""
-    wide = replace(calibration, tangent=(*calibration.tangent, "d_SR"),
-                   covariance=block_diag(calibration.covariance, 0.2**2))
+    wide = replace(
+        calibration, tangent=(*calibration.tangent, "d_SR"), covariance=block_diag(calibration.covariance, 0.2**2)
+    )
     grid = tp.VoxelGrid.cube(n=SIZE, spacing=VOXEL)
     draws = 10
     found = simulated_errors(run, plan(), grid, draws=draws, calibration=wide, seed=3)
@@ -119,21 +151,31 @@ def kinematic(run, calibration):
     """The same with errors of a manipulator, a linear map, as well known as before it was calibrated."""
     machine = PoseMap(order=1, t_scale=1.0)
     block = manipulator_block(machine, np.zeros(len(machine.names)), machine.sigma, run.poses)
-    return replace(calibration, model="kinematic", manipulator=block, tangent=(*calibration.tangent, *machine.names),
-                   covariance=block_diag(calibration.covariance, np.diag(machine.sigma**2)))
+    return replace(
+        calibration,
+        model="kinematic",
+        manipulator=block,
+        tangent=(*calibration.tangent, *machine.names),
+        covariance=block_diag(calibration.covariance, np.diag(machine.sigma**2)),
+    )
 
 
 def test_drawn_errors_of_a_manipulator_scatter_as_their_covariance_says(run, kinematic):
     """Centres placed by the drawn matrices: between them only what the covariance's own share says."""
     grid, draws = tp.VoxelGrid.cube(n=SIZE, spacing=VOXEL), 60
     features = {f"ball {k}": fit_sphere(sphere_pattern(b, RADIUS, 200)[0]) for k, b in enumerate(BALLS)}
-    rigid, stated = (calibration_shares(results(features), plan(), "scan", c, run.poses)["SD"] for c in (
-        replace(kinematic, manipulator={}, tangent=kinematic.tangent[:6], covariance=kinematic.covariance[:6, :6]),
-        kinematic))
+    rigid, stated = (
+        calibration_shares(results(features), plan(), "scan", c, run.poses)["SD"]
+        for c in (
+            replace(kinematic, manipulator={}, tangent=kinematic.tangent[:6], covariance=kinematic.covariance[:6, :6]),
+            kinematic,
+        )
+    )
     assert stated > 5 * rigid
     P = drawn_matrices(run, grid, None, np.random.default_rng(0)).P
-    found = np.array([displaced(drawn_matrices(run, grid, kinematic, np.random.default_rng(k)).P, P, BALLS)
-                      for k in range(draws)])
+    found = np.array(
+        [displaced(drawn_matrices(run, grid, kinematic, np.random.default_rng(k)).P, P, BALLS) for k in range(draws)]
+    )
     lengths = np.linalg.norm(found[:, 1] - found[:, 0], axis=1)
     assert lengths.std(ddof=1) == pytest.approx(stated, rel=3 / np.sqrt(2 * (draws - 1)))
     # The part as a whole stays where it is.
@@ -150,8 +192,11 @@ def test_a_scene_whose_manipulator_errs_is_believed_to_stand_where_the_calibrati
     """Identified errors are undone; without them the balls come out smeared and elsewhere."""
     machine = PoseMap(order=1, t_scale=1.0)
     errors = 3 * machine.sigma * np.random.default_rng(2).standard_normal(len(machine.names))
-    exact = replace(kinematic, covariance=1e-12 * np.eye(len(kinematic.tangent)),
-                    manipulator=manipulator_block(machine, errors, machine.sigma, run.poses))
+    exact = replace(
+        kinematic,
+        covariance=1e-12 * np.eye(len(kinematic.tangent)),
+        manipulator=manipulator_block(machine, errors, machine.sigma, run.poses),
+    )
     real = machine.real_poses(run.poses, errors)
     errs = replace(run, T_MH=replace(run.T_MH, R=real.R, t=real.t))
     grid = tp.VoxelGrid.cube(n=SIZE, spacing=VOXEL)
@@ -188,8 +233,13 @@ def test_virtual_scans_scatter_by_noise_and_repeat():
 
 def test_raw_frames_are_corrected_by_their_own_references():
     content = scene(120.0)
-    raw = content.model_copy(update={"detector": content.detector.model_copy(
-        update={"output": "raw", "dark": 500.0, "gain_spread": 0.02, "white": 40000.0})})
+    raw = content.model_copy(
+        update={
+            "detector": content.detector.model_copy(
+                update={"output": "raw", "dark": 500.0, "gain_spread": 0.02, "white": 40000.0}
+            )
+        }
+    )
     grid = tp.VoxelGrid.cube(n=SIZE, spacing=VOXEL)
     pair = [next(virtual_volumes(tp.simulate(s), grid, draws=1)).values for s in (content, raw)]
     inside = pair[0] > 0.7 * pair[0].max()

@@ -36,8 +36,9 @@ def silent(done: int, total: int) -> None:
 def measured_from_truth(run, seed: int, ellipse_px: float = 0.0209, best_px: float = 0.0005) -> Measured:
     rng = np.random.default_rng(seed)
     noisy = [run.x_D + rng.normal(scale=s / np.sqrt(2), size=run.x_D.shape) for s in (ellipse_px, best_px)]
-    return Measured(by_ellipse=noisy[0],
-                    best=BallObservations.from_sigma(noisy[1], best_px / np.sqrt(2), pose_id=run.poses.pose_id))
+    return Measured(
+        by_ellipse=noisy[0], best=BallObservations.from_sigma(noisy[1], best_px / np.sqrt(2), pose_id=run.poses.pose_id)
+    )
 
 
 def test_unknown_names_and_scales_are_refused():
@@ -72,7 +73,7 @@ def test_radiographs_are_measured_both_ways_and_resumed(tmp_path):
 def test_windows_hold_the_ball_in_their_middle():
     run = table1.ball_run(2.7, 2, 7)
     run = replace(run, poses=run.poses.select([3]), T_MH=run.T_MH[[3]])
-    (origin, window), = read_out_windows(run)
+    ((origin, window),) = read_out_windows(run)
     x = project_ball(window.scanner, T_HT=run.T_HT, T_MH=run.T_MH, t=run.t)[0]
     np.testing.assert_allclose(x + origin, run.x_D[0], atol=1e-9)
     n_v, n_u = window.scanner.shape
@@ -98,8 +99,15 @@ def test_nearly_exact_centres_give_the_mount_as_nearly():
 
 def test_table1_rows_stand_beside_their_printed_numbers():
     case = table1.Case(magnification=5.3, n=2)
-    content = {side: {"d_rms_opt": 0.02, "d_rms_exact": 0.021, "errors": dict.fromkeys(table1.NAMES, 1e-3),
-                      "u": dict.fromkeys(table1.NAMES, 2e-3)} for side in ("paper_method", "best")}
+    content = {
+        side: {
+            "d_rms_opt": 0.02,
+            "d_rms_exact": 0.021,
+            "errors": dict.fromkeys(table1.NAMES, 1e-3),
+            "u": dict.fromkeys(table1.NAMES, 2e-3),
+        }
+        for side in ("paper_method", "best")
+    }
     rows = table1.rows_of(case, content)
     assert len(rows) == 11
     assert {r.source for r in rows} == {"table 1, row 4"}

@@ -36,8 +36,12 @@ from tomopose.trajectory.tilt import eq11_triangle
 
 SCANNER = Scanner(d_SD=1200.0, d_SR=310.0, p_u=2.0, p_v=2.5, u_0=70.3, v_0=66.8, n_u=151, n_v=123)
 TINY = Numbers(
-    binning={"specimen": 14, "standard": 11}, views={"specimen": 63, "standard": 42},
-    runs={"specimen": (1,), "standard": (1,)}, edge=2.0, samples=1, radiographs=False,
+    binning={"specimen": 14, "standard": 11},
+    views={"specimen": 63, "standard": 42},
+    runs={"specimen": (1,), "standard": (1,)},
+    edge=2.0,
+    samples=1,
+    radiographs=False,
 )
 
 

@@ -85,9 +85,16 @@ def test_the_outline_of_a_ball_is_that_of_its_surface_points(scanner, T_HT, rng)
     for k in (0, 13, 60, 111):
         one = PoseSequence(T_MH=poses.T_MH[k : k + 1], pose_id=("k",), alpha=poses.alpha[k : k + 1])
         x_D = project_ball(
-            scanner, T_HT=T_HT, t=surface, alpha=np.full(len(surface), one.alpha[0]),
-            T_MH=RigidTransform(R=np.repeat(one.T_MH.R, len(surface), axis=0), source=Frame.M, target=Frame.H,
-                                t=np.repeat(one.T_MH.t, len(surface), axis=0)),
+            scanner,
+            T_HT=T_HT,
+            t=surface,
+            alpha=np.full(len(surface), one.alpha[0]),
+            T_MH=RigidTransform(
+                R=np.repeat(one.T_MH.R, len(surface), axis=0),
+                source=Frame.M,
+                target=Frame.H,
+                t=np.repeat(one.T_MH.t, len(surface), axis=0),
+            ),
         )
         assert (x_D.min(axis=0) >= low[k] - 1e-6).all()
         assert (x_D.max(axis=0) <= high[k] + 1e-6).all()

@@ -64,8 +64,9 @@ def test_the_general_wave_stays_within_its_amplitude_and_repeats(amplitude, peri
     alpha = np.linspace(0, 2 * math.pi, 997)
     wave = triangle_wave(alpha, amplitude=amplitude, periods=periods, phase=phase, offset=offset)
     assert np.abs(wave - offset).max() <= amplitude * (1 + 1e-12)
-    again = triangle_wave(alpha + 2 * math.pi / periods, amplitude=amplitude, periods=periods, phase=phase,
-                          offset=offset)
+    again = triangle_wave(
+        alpha + 2 * math.pi / periods, amplitude=amplitude, periods=periods, phase=phase, offset=offset
+    )
     np.testing.assert_allclose(again, wave, atol=1e-11)
 
 

@@ -103,8 +103,11 @@ def _extra(solution: Solution, checks: Integrity, chi2_dof: float) -> dict[str, 
     }
     if solution.noise is not None:
         extra["pose_noise"] = {
-            "translation_mm": solution.noise.translation, "rotation_rad": solution.noise.rotation,
-            "gain": solution.noise.gain, "chi2_dof_with": solution.chi2 / solution.dof, "chi2_dof_without": chi2_dof,
+            "translation_mm": solution.noise.translation,
+            "rotation_rad": solution.noise.rotation,
+            "gain": solution.noise.gain,
+            "chi2_dof_with": solution.chi2 / solution.dof,
+            "chi2_dof_without": chi2_dof,
         }
     if p.not_seen:
         extra["not_seen"] = dict(p.not_seen)
@@ -123,8 +126,9 @@ def _expected_px(solution: Solution) -> float:
     return float(np.sqrt(total * max(1.0 - m / (2 * n), 0.0)))
 
 
-def _calibration(solution: Solution, stated: Solution, diagnosis: Diagnosis | None,
-                 arguments: Mapping[str, Any]) -> Calibration:
+def _calibration(
+    solution: Solution, stated: Solution, diagnosis: Diagnosis | None, arguments: Mapping[str, Any]
+) -> Calibration:
     p, fit, free = solution.used, solution.fit, solution.free
     scanners = adjusted_scanners(p.scanners, free, fit.delta)
     assumed = assumed_names(free)
@@ -148,7 +152,8 @@ def _calibration(solution: Solution, stated: Solution, diagnosis: Diagnosis | No
         manipulator={"translation_scale": scale} if scale != 1.0 else {},
         converged=fit.converged,
         status=(
-            f"optimum of {len(p)} poses reached" if fit.converged
+            f"optimum of {len(p)} poses reached"
+            if fit.converged
             else "the iteration ended before it reached an optimum"
         ),
         hypotheses=tuple(h.to_json() for h in diagnosis.hypotheses) if diagnosis else (),
@@ -159,9 +164,17 @@ def _calibration(solution: Solution, stated: Solution, diagnosis: Diagnosis | No
     )
     word, reasons = verdict(
         Findings(
-            converged=result.converged, dof=result.dof, n_used=len(p), n_outliers=len(result.outliers),
-            misfit=stated.robust.misfit, chi2_dof=result.chi2_dof, residual_px=result.d_rms,
-            expected_px=_expected_px(stated), scan_px=tilt_sigma(result), diagnosis=diagnosis, integrity=checks,
+            converged=result.converged,
+            dof=result.dof,
+            n_used=len(p),
+            n_outliers=len(result.outliers),
+            misfit=stated.robust.misfit,
+            chi2_dof=result.chi2_dof,
+            residual_px=result.d_rms,
+            expected_px=_expected_px(stated),
+            scan_px=tilt_sigma(result),
+            diagnosis=diagnosis,
+            integrity=checks,
         )
     )
     return replace(result, verdict=word, reasons=reasons)
@@ -227,7 +240,11 @@ def calibrate(
         quick = [r for r in (*known, *([other] if other else [])) if r.quick]
         diagnosis = ranked(stated.used, freed, stated.fit, quick, starts=0)
     arguments = {
-        "model": model, "free": list(free), "fix": list(fix), "priors": dict(priors or {}), "robust": robust,
+        "model": model,
+        "free": list(free),
+        "fix": list(fix),
+        "priors": dict(priors or {}),
+        "robust": robust,
         "pose_noise": pose_noise if pose_noise is None or isinstance(pose_noise, str) else list(pose_noise),
     }
     rigid = _calibration(solution, stated, diagnosis, arguments)
@@ -238,6 +255,13 @@ def calibrate(
     from tomopose.calibration.identified.calibrate import calibrate_kinematic
 
     return calibrate_kinematic(
-        scanner, poses, observations, manipulator=manipulator, model=model, rigid=rigid, free=freed,
-        distances=distances, robust=robust,
+        scanner,
+        poses,
+        observations,
+        manipulator=manipulator,
+        model=model,
+        rigid=rigid,
+        free=freed,
+        distances=distances,
+        robust=robust,
     )

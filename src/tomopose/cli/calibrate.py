@@ -65,12 +65,15 @@ def require_arrangement(
         raise typer.BadParameter(f"{arrangement!r} is none of {', '.join(ARRANGEMENTS)}", param_hint="--arrangement")
     if (twin is None) != (source_poses is None):
         lost, there = ("--twin", "--source-poses") if twin is None else ("--source-poses", "--twin")
-        raise typer.BadParameter(f"{there} needs {lost}: twin robots have a description and two tables",
-                                 param_hint=lost)
+        raise typer.BadParameter(
+            f"{there} needs {lost}: twin robots have a description and two tables", param_hint=lost
+        )
     moving = arrangement == "moving-scanner"
     if twin is not None and (manipulator is not None or moving):
-        raise typer.BadParameter("twin.json names both robots and says what moves; leave out --manipulator and "
-                                 "--arrangement", param_hint="--twin")
+        raise typer.BadParameter(
+            "twin.json names both robots and says what moves; leave out --manipulator and --arrangement",
+            param_hint="--twin",
+        )
     if distance_sigma and not moving:
         raise typer.BadParameter("serves --arrangement moving-scanner", param_hint="--d-sd-sigma-mm")
     return moving
@@ -101,18 +104,26 @@ def calibrate(
     ] = None,
     arrangement: Annotated[
         str,
-        typer.Option("--arrangement", help="What the manipulator carries: moving-object, or moving-scanner (source "
-                     "and detector; C-arm, gantry), where the ball stands still."),
+        typer.Option(
+            "--arrangement",
+            help="What the manipulator carries: moving-object, or moving-scanner (source "
+            "and detector; C-arm, gantry), where the ball stands still.",
+        ),
     ] = "moving-object",
     distance_sigma: Annotated[
         float,
-        typer.Option("--d-sd-sigma-mm", min=0.0, help="With moving-scanner: scatter of d_SD from view to view, one "
-                     "more number a view; 0: source and detector are fixed to one another."),
+        typer.Option(
+            "--d-sd-sigma-mm",
+            min=0.0,
+            help="With moving-scanner: scatter of d_SD from view to view, one "
+            "more number a view; 0: source and detector are fixed to one another.",
+        ),
     ] = 0.0,
     twin: Annotated[
         Path | None,
-        typer.Option("--twin", help="twin.json: source and detector on a robot each; --poses is then the detector's "
-                     "table."),
+        typer.Option(
+            "--twin", help="twin.json: source and detector on a robot each; --poses is then the detector's table."
+        ),
     ] = None,
     source_poses: SourcePosesOption = None,
     dark: DarkOption = None,
@@ -163,8 +174,15 @@ def calibrate(
         observed = tp.read_observations(observations)
     else:
         stack = open_for(
-            say, image_source(str(images)), geometry, sequence,
-            dark=dark, flat=flat, dataset=dataset, rows=rows, raw=raw,
+            say,
+            image_source(str(images)),
+            geometry,
+            sequence,
+            dark=dark,
+            flat=flat,
+            dataset=dataset,
+            rows=rows,
+            raw=raw,
         )
         note_missing_flat(say, flat)
         observed = observe(say, geometry, stack, sequence, ball_diameter=ball_diameter, workers=workers)
@@ -172,9 +190,7 @@ def calibrate(
     try:
         if twins is not None and source_poses is not None:
             robots = twins.robots(tp.read_poses(source_poses, forward=forward_of(twins.source)))
-            result = tp.calibrate_twin(
-                geometry, sequence, observed, twin=robots, mount=twins.mount(geometry), **given
-            )
+            result = tp.calibrate_twin(geometry, sequence, observed, twin=robots, mount=twins.mount(geometry), **given)
         elif moving:
             result = tp.calibrate_inverse(
                 geometry, sequence, observed, manipulator=errors, d_SD_sigma=distance_sigma, **given
@@ -194,10 +210,16 @@ def calibrate(
             say.note(f"note: {size}")
     made = provenance(
         inputs=[scanner, poses, *(p for p in (observations, manipulator, twin, source_poses) if p is not None)],
-        arguments=arguments(model=model, free=free, fix=fix, distance=distance, ball_diameter_mm=ball_diameter,
-                            images=None if images is None else len(observed),
-                            arrangement="twin" if twins is not None else arrangement,
-                            d_sd_sigma_mm=distance_sigma or None),
+        arguments=arguments(
+            model=model,
+            free=free,
+            fix=fix,
+            distance=distance,
+            ball_diameter_mm=ball_diameter,
+            images=None if images is None else len(observed),
+            arrangement="twin" if twins is not None else arrangement,
+            d_sd_sigma_mm=distance_sigma or None,
+        ),
     )
     result = replace(result, provenance=made)
     write_calibration_folder(out, result, observed, shown, images=stack, force=force)

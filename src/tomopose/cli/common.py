@@ -27,9 +27,7 @@ SourcePosesOption = Annotated[
     typer.Option("--source-poses", help="Twin robots: poses or joint values of the source's robot, by pose_id."),
 ]
 WorkersOption = Annotated[int, typer.Option("--workers", min=1, help="Processes to use.")]
-ImagesOption = Annotated[
-    str | None, typer.Option("--images", help="Folder, glob or multi-page file of radiographs.")
-]
+ImagesOption = Annotated[str | None, typer.Option("--images", help="Folder, glob or multi-page file of radiographs.")]
 ObservationsOption = Annotated[
     Path | None, typer.Option("--observations", help="observations.csv, instead of --images.")
 ]
@@ -37,8 +35,8 @@ DarkOption = Annotated[str | None, typer.Option("--dark", help="Dark frames, wit
 FlatOption = Annotated[str | None, typer.Option("--flat", help="Flat frames: images become transmission.")]
 DatasetOption = Annotated[str | None, typer.Option("--dataset", help="Dataset in an HDF5 file.")]
 RowsOption = Annotated[
-    str | None, typer.Option("--rows", help="Row order of the image files, top-first or bottom-first; overrides "
-                             "scanner.json.")
+    str | None,
+    typer.Option("--rows", help="Row order of the image files, top-first or bottom-first; overrides scanner.json."),
 ]
 RawOption = Annotated[
     str | None, typer.Option("--raw", help="Layout of RAW files, NVxNU:TYPE[:HEADER_BYTES], e.g. 2048x2048:<u2:512.")
@@ -84,8 +82,14 @@ def _bar(label: str) -> Iterator[Progress]:
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as RichProgress
 
-    columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
-               TimeRemainingColumn())
+    columns = (
+        TextColumn(label),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
     with RichProgress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(label, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -48,8 +48,13 @@ def demo(
         require_absent(out / name, force=force)
     setup = demo_setup(grid=3 if paper else 2, small=small)
     run = tp.simulate_ball_run(
-        setup.scanner, T_HT=setup.T_HT, t=setup.t, poses=setup.poses, ball_diameter=setup.ball_diameter,
-        snr=setup.snr, seed=setup.seed,
+        setup.scanner,
+        T_HT=setup.T_HT,
+        t=setup.t,
+        poses=setup.poses,
+        ball_diameter=setup.ball_diameter,
+        snr=setup.snr,
+        seed=setup.seed,
     )
     with say.progress("simulating") as progress, ThreadPoolExecutor(max_workers=1) as beside:
         rehearsal = beside.submit(rehearse, setup)
@@ -73,8 +78,7 @@ def demo(
     turned = float(rotation_angle_between(setup.T_HT.R, calibration.T_HT.R)) * 1e6
     summary, lines = calibration_summary(calibration)
     say.result(
-        {"out": out.name, **summary, "error_t_HT_um": off, "error_R_HT_urad": turned,
-         "d_rms_exact_px": found},
+        {"out": out.name, **summary, "error_t_HT_um": off, "error_R_HT_urad": turned, "d_rms_exact_px": found},
         [
             *lines,
             f"  against the simulation's truth: t_HT off by {off[0]:+.2f}, {off[1]:+.2f}, {off[2]:+.2f} um, "

@@ -65,12 +65,19 @@ def detect(
     require_absent(out, force=force)
     geometry = tp.read_scanner(scanner)
     sequence = None if poses is None else tp.read_poses(poses)
-    stack = open_for(say, image_source(images), geometry, sequence, dark=dark, flat=flat, dataset=dataset, rows=rows,
-                         raw=raw)
+    stack = open_for(
+        say, image_source(images), geometry, sequence, dark=dark, flat=flat, dataset=dataset, rows=rows, raw=raw
+    )
     note_missing_flat(say, flat)
     with executor_of(dask) as executor:
         found = observe(
-            say, geometry, stack, sequence, ball_diameter=ball_diameter, workers=workers, executor=executor,
+            say,
+            geometry,
+            stack,
+            sequence,
+            ball_diameter=ball_diameter,
+            workers=workers,
+            executor=executor,
             journal=resume,
         )
     tp.write_observations(out, found, force=force)

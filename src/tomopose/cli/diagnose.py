@@ -60,8 +60,11 @@ def diagnose(
     if len(found.hypotheses) > SHOWN:
         lines.append(f"and {len(found.hypotheses) - SHOWN} more that fit worse (--json lists all)")
     say.result(
-        {"hypotheses": [h.to_json() for h in found.hypotheses], "leading": [h.name for h in found.leading],
-         "advice": list(found.advice)},
+        {
+            "hypotheses": [h.to_json() for h in found.hypotheses],
+            "leading": [h.name for h in found.leading],
+            "advice": list(found.advice),
+        },
         [*lines, *found.advice],
     )
     return NOT_TRUSTWORTHY if found.better else OK

@@ -23,8 +23,20 @@ EXTRAS = {
     "step": ("cascadio",),
     "dask": ("dask", "distributed"),
 }
-CORE = ("numpy", "scipy", "numba", "pydantic", "typer", "rich", "tifffile", "imagecodecs", "h5py", "pydicom", "jinja2",
-        "plotly")
+CORE = (
+    "numpy",
+    "scipy",
+    "numba",
+    "pydantic",
+    "typer",
+    "rich",
+    "tifffile",
+    "imagecodecs",
+    "h5py",
+    "pydicom",
+    "jinja2",
+    "plotly",
+)
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 

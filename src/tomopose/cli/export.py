@@ -20,8 +20,11 @@ def export(
     matrices: Annotated[Path, typer.Option("--matrices", help="matrices.npz, as `tomopose matrices` writes it.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for the geometry files and manifest.json.")],
     to: Annotated[
-        str, typer.Option("--to", help="Formats, separated by commas, or all: astra, rtk, leap, tigre, cil, cera, "
-                          "openct, ctsimu, pyronn.")
+        str,
+        typer.Option(
+            "--to",
+            help="Formats, separated by commas, or all: astra, rtk, leap, tigre, cil, cera, openct, ctsimu, pyronn.",
+        ),
     ] = "all",
     rows: Annotated[
         str, typer.Option("--rows", help="Row 0 of the projection arrays: bottom (row index = v) or top.")

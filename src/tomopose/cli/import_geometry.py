@@ -19,14 +19,17 @@ def register(app: typer.Typer) -> None:
 def import_geometry(
     file: Annotated[
         Path,
-        typer.Argument(help="RTK .xml, ASTRA .npy, CERA .config or table, openCT or CTSimU .json, leap, tigre, cil or "
-                       "pyronn .npz, or an export folder."),
+        typer.Argument(
+            help="RTK .xml, ASTRA .npy, CERA .config or table, openCT or CTSimU .json, leap, tigre, cil or "
+            "pyronn .npz, or an export folder."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", help="matrices.npz to write.")],
     format: Annotated[
         str | None,
-        typer.Option("--format", help="Where the file does not say: rtk, astra, cera, openct, ctsimu, leap, tigre, "
-                     "cil, pyronn."),
+        typer.Option(
+            "--format", help="Where the file does not say: rtk, astra, cera, openct, ctsimu, leap, tigre, cil, pyronn."
+        ),
     ] = None,
     n_u: Annotated[int | None, typer.Option("--n-u-px", help="Detector width, px.")] = None,
     n_v: Annotated[int | None, typer.Option("--n-v-px", help="Detector height, px.")] = None,
@@ -48,9 +51,7 @@ def import_geometry(
         raise typer.BadParameter(f"{rows!r} is neither bottom nor top", param_hint="--rows")
     order: Literal["bottom", "top"] | None = None if rows is None else ("top" if rows == "top" else "bottom")
     say = Say(json=as_json, quiet=quiet)
-    matrices = tp.read_geometry(
-        file, format=format, n_u=n_u, n_v=n_v, p_u=p_u, p_v=p_v, rows=order, side=side
-    )
+    matrices = tp.read_geometry(file, format=format, n_u=n_u, n_v=n_v, p_u=p_u, p_v=p_v, rows=order, side=side)
     source = file / "manifest.json" if file.is_dir() else file
     given = arguments(format=format, n_u=n_u, n_v=n_v, rows=rows)
     made = provenance(inputs=[source, *([side] if side else [])], arguments=given)

@@ -73,8 +73,10 @@ def forward_of(machine: Any) -> Any:
 def note_missing_flat(say: Say, flat: str | None) -> None:
     """Says what becomes of radiographs that nobody has corrected."""
     if flat is None:
-        say.note("note: no flat field given; unless the radiographs are corrected already, pixel gains count as noise "
-                 "and the background is fitted round the ball alone")
+        say.note(
+            "note: no flat field given; unless the radiographs are corrected already, pixel gains count as noise "
+            "and the background is fitted round the ball alone"
+        )
 
 
 @contextlib.contextmanager
@@ -171,9 +173,7 @@ def calibration_summary(calibration: Calibration) -> tuple[dict[str, Any], list[
         "poses_used": len(calibration.pose_id),
         "outliers": dict(calibration.outliers),
         "model": calibration.model,
-        "parameters": [
-            {"name": p.name, "value": p.value, "u": p.u, "unit": p.unit} for p in calibration.parameters
-        ],
+        "parameters": [{"name": p.name, "value": p.value, "u": p.u, "unit": p.unit} for p in calibration.parameters],
     }
     lines = [
         f"{calibration.verdict}: {calibration.status}",

@@ -29,9 +29,7 @@ def register(app: typer.Typer) -> None:
     app.command("matrices", epilog=EPILOG)(matrices)
 
 
-def require_tables(
-    cal: Any, path: Path, *, source_poses: Path | None, home: str | None, commands: Path | None
-) -> None:
+def require_tables(cal: Any, path: Path, *, source_poses: Path | None, home: str | None, commands: Path | None) -> None:
     """InputError where the tables and options do not fit the calibration's arrangement."""
     from tomopose.errors import InputError
 
@@ -41,8 +39,9 @@ def require_tables(
     if not twins and source_poses is not None:
         raise InputError(f"{path} is not of twin robots; --source-poses belongs to a calibration made with --twin")
     if twins and (home is not None or commands is not None):
-        raise InputError("twin robots: W is that of the first view, and commands are not corrected; leave out --home "
-                         "and --commands")
+        raise InputError(
+            "twin robots: W is that of the first view, and commands are not corrected; leave out --home and --commands"
+        )
     if commands is not None and cal.model == "rigid":
         raise InputError(f"{path} holds no errors of the manipulator; command the poses as they are")
 
@@ -66,8 +65,11 @@ def matrices(
     source_poses: SourcePosesOption = None,
     manipulator: Annotated[
         Path | None,
-        typer.Option("--manipulator", help="robot.json (or twin.json): for tables of joint values alone, where the "
-                     "calibration trusts the robot and does not hold it."),
+        typer.Option(
+            "--manipulator",
+            help="robot.json (or twin.json): for tables of joint values alone, where the "
+            "calibration trusts the robot and does not hold it.",
+        ),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -130,14 +132,22 @@ def matrices(
         told += f": {shared:.2g} px of the calibration, shared by all views, and "
         told += f"{own:.2g} px of the manipulator's scatter" if own else "no known scatter of the manipulator"
     say.result(
-        {"out": out.name, "views": len(result), "n_u_px": result.n_u, "n_v_px": result.n_v, "points_sigma_px": sigma,
-         "points_sigma_shared_px": shared,
-         "calibration_verdict": cal.verdict},
+        {
+            "out": out.name,
+            "views": len(result),
+            "n_u_px": result.n_u,
+            "n_v_px": result.n_v,
+            "points_sigma_px": sigma,
+            "points_sigma_shared_px": shared,
+            "calibration_verdict": cal.verdict,
+        },
         [f"{out}: {len(result)} matrices for images of {result.n_u} x {result.n_v} px; uncertainty {told}"],
     )
     if home is None and source_poses is None and (result.P[:, 2, 3] <= 0).any():
-        say.note("note: at the machine's zero the W origin lies behind the source; a pose of the scan as --home puts "
-                 "the object near it")
+        say.note(
+            "note: at the machine's zero the W origin lies behind the source; a pose of the scan as --home puts "
+            "the object near it"
+        )
     if cal.verdict != "trustworthy":
         say.note(f"note: the calibration's verdict is {cal.verdict}: {'; '.join(cal.reasons)}")
     return OK

@@ -108,14 +108,22 @@ def measure(
     files = named_files(volume, "volume")
     mesh = None if reference is None else reference_of(reference, edge_mm, probed, between)
     volumes = {name: read_volume(file) for name, file in files.items()}
-    calibrations, scans = (named_files(x or (), w, default="") for x, w in ((calibration, "calibration"),
-                                                                           (poses, "poses")))
+    calibrations, scans = (
+        named_files(x or (), w, default="") for x, w in ((calibration, "calibration"), (poses, "poses"))
+    )
     given = [plan, *files.values(), *calibrations.values(), *scans.values()]
     made = provenance(
-        inputs=[*given, *(p for p in (reference, probed, scene) if p is not None)], seed=seed if scene else None,
-        arguments=arguments(fit=fit, range_um=range_um, search_mm=search_mm, edge_mm=edge_mm,
-                            cmm_interpolation=between if probed else None,
-                            draws=draws if scene else None, simulate_voxel=coarser if scene else None),
+        inputs=[*given, *(p for p in (reference, probed, scene) if p is not None)],
+        seed=seed if scene else None,
+        arguments=arguments(
+            fit=fit,
+            range_um=range_um,
+            search_mm=search_mm,
+            edge_mm=edge_mm,
+            cmm_interpolation=between if probed else None,
+            draws=draws if scene else None,
+            simulate_voxel=coarser if scene else None,
+        ),
     )
     with say.progress("measuring") as progress:
         results = carry_out(volumes, wanted, provenance=made, progress=progress)
@@ -123,15 +131,24 @@ def measure(
         results = replace(results, calibration_u=calibration_u(results, wanted, calibrations, scans))
     if scene is not None:
         with say.progress("virtual scans") as progress:
-            drawn = simulated(scene, wanted, next(iter(volumes.values())), calibrations, draws=draws, seed=seed,
-                              coarser=coarser, progress=progress)
+            drawn = simulated(
+                scene,
+                wanted,
+                next(iter(volumes.values())),
+                calibrations,
+                draws=draws,
+                seed=seed,
+                coarser=coarser,
+                progress=progress,
+            )
         results = replace(results, simulated=drawn)
     comparisons = {}
     if mesh is not None:
         for name, one in volumes.items():
             comparisons[name] = compared(one, mesh, results.alignments[name], fit=fit, search_mm=search_mm)
-            write_comparison_to(out / name if len(volumes) > 1 else out, comparisons[name], range_um / 1000, name,
-                                force=force)
+            write_comparison_to(
+                out / name if len(volumes) > 1 else out, comparisons[name], range_um / 1000, name, force=force
+            )
     write_results(results, out, force=force)
     write_report(page, measurement_report(results, comparisons=comparisons, range_mm=range_um / 1000))
     say.result(*told(out, results, comparisons))
@@ -159,8 +176,9 @@ def compared(volume: Any, mesh: Any, alignment: Any, *, fit: str, search_mm: flo
 
     if fit == "datum" and not alignment.rule.startswith("datum"):
         raise InputError('--fit datum needs a plan with [alignment] kind = "datum" and three datums')
-    return compare(volume, mesh, alignment=alignment, fit="best-fit" if fit == "best-fit" else "none",
-                   search_mm=search_mm)
+    return compare(
+        volume, mesh, alignment=alignment, fit="best-fit" if fit == "best-fit" else "none", search_mm=search_mm
+    )
 
 
 def write_comparison_to(folder: Path, comparison: Any, range_mm: float, name: str, *, force: bool) -> None:
@@ -195,7 +213,14 @@ def calibration_u(
 
 
 def simulated(
-    scene: Path, plan: Any, volume: Any, calibrations: dict[str, Path], *, draws: int, seed: int, coarser: float,
+    scene: Path,
+    plan: Any,
+    volume: Any,
+    calibrations: dict[str, Path],
+    *,
+    draws: int,
+    seed: int,
+    coarser: float,
     progress: Any,
 ) -> Any:
     """Errors over virtual scans on the volume's own grid, or a coarser one over the same box."""
@@ -208,20 +233,38 @@ def simulated(
     grid = volume.grid
     shape = tuple(max(round(n / coarser), 2) for n in grid.shape)
     box = tp.VoxelGrid(shape=shape, spacing=grid.spacing * coarser, centre=grid.centre)
-    return simulated_errors(run, plan, box, draws=draws, seed=seed, progress=progress,
-                            calibration=None if file is None else tp.read_calibration(file))
+    return simulated_errors(
+        run,
+        plan,
+        box,
+        draws=draws,
+        seed=seed,
+        progress=progress,
+        calibration=None if file is None else tp.read_calibration(file),
+    )
 
 
 def told(out: Path, results: Any, comparisons: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """The summary for programs, and its lines for people."""
     beyond = results.out_of_limits
     judged = sum(r.within is not None for r in results.results)
-    lines = [f"{out}: {len(results)} results of {len(results.volumes)} volume(s); "
-             + (f"{len(beyond)} of {judged} beyond their limit" if judged else "no limits given")]
-    lines += [f"  {r.volume} {r.name}: {r.value:.5f} {r.unit}, error {1000 * (r.error or 0.0):+.2f} um, limit "
-              f"{1000 * (r.limit or 0.0):.2f} um" for r in beyond[:10]]
-    summary = {"out": out.name, "results": len(results), "volumes": list(results.volumes), "judged": judged,
-               "beyond_limits": [r.name for r in beyond], "scale": dict(results.scale),
-               "alignments": {n: a.to_json() for n, a in results.alignments.items()},
-               "comparisons": {n: c.to_json() for n, c in comparisons.items()}}
+    lines = [
+        f"{out}: {len(results)} results of {len(results.volumes)} volume(s); "
+        + (f"{len(beyond)} of {judged} beyond their limit" if judged else "no limits given")
+    ]
+    lines += [
+        f"  {r.volume} {r.name}: {r.value:.5f} {r.unit}, error {1000 * (r.error or 0.0):+.2f} um, limit "
+        f"{1000 * (r.limit or 0.0):.2f} um"
+        for r in beyond[:10]
+    ]
+    summary = {
+        "out": out.name,
+        "results": len(results),
+        "volumes": list(results.volumes),
+        "judged": judged,
+        "beyond_limits": [r.name for r in beyond],
+        "scale": dict(results.scale),
+        "alignments": {n: a.to_json() for n, a in results.alignments.items()},
+        "comparisons": {n: c.to_json() for n, c in comparisons.items()},
+    }
     return summary, lines

@@ -21,8 +21,10 @@ def monitor(
     add: Annotated[Path | None, typer.Option("--add", help="calibration.json to add.")] = None,
     label: Annotated[str, typer.Option("--label", help="A word to find the calibration again by.")] = "",
     out: Annotated[
-        Path | None, typer.Option("--out", help="Control charts as one HTML file, from three calibrations on; it is "
-                                  "drawn anew each time.")
+        Path | None,
+        typer.Option(
+            "--out", help="Control charts as one HTML file, from three calibrations on; it is drawn anew each time."
+        ),
     ] = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,

@@ -60,8 +60,15 @@ def plan_limits(*, half_range: float, tilt: float, table_angles: tuple[float, ..
 
 
 def kinematic_poses(
-    scanner: Scanner, machine: Any, *, half_range: float, tilt: float, table_angles: tuple[float, ...],
-    ball_diameter: float, images: int, spin: float,
+    scanner: Scanner,
+    machine: Any,
+    *,
+    half_range: float,
+    tilt: float,
+    table_angles: tuple[float, ...],
+    ball_diameter: float,
+    images: int,
+    spin: float,
 ) -> Any:
     """The plan that determines what a tilted scan needs of the manipulator's own errors; angles in degrees."""
     import numpy as np
@@ -77,24 +84,45 @@ def kinematic_poses(
         from tomopose.planning.robot_candidates import robot_work
 
         work = robot_work(
-            machine, half_range=half_range, tilt=math.radians(tilt), spin=math.radians(spin),
+            machine,
+            half_range=half_range,
+            tilt=math.radians(tilt),
+            spin=math.radians(spin),
             table_angles=tuple(math.radians(a) for a in table_angles),
         )
         return plan_kinematic(
-            scanner, machine, T_HT=work.T_HT, balls=ball, candidates=work.candidates, scan=work.scan,
-            points=object_points(), n=images,
+            scanner,
+            machine,
+            T_HT=work.T_HT,
+            balls=ball,
+            candidates=work.candidates,
+            scan=work.scan,
+            points=object_points(),
+            n=images,
         )
     limits = plan_limits(half_range=half_range, tilt=tilt, table_angles=table_angles, ball_diameter=ball_diameter)
     mount = nominal_mount()
     return plan_kinematic(
-        scanner, machine, T_HT=mount, balls=ball, candidates=candidates(scanner, T_HT=mount, t=ball, limits=limits),
-        scan=default_scan(mount), points=object_points(), n=images,
+        scanner,
+        machine,
+        T_HT=mount,
+        balls=ball,
+        candidates=candidates(scanner, T_HT=mount, t=ball, limits=limits),
+        scan=default_scan(mount),
+        points=object_points(),
+        n=images,
     )
 
 
 def best_poses(
-    scanner: Scanner, *, half_range: float, tilt: float, table_angles: tuple[float, ...], ball_diameter: float,
-    images: int | None, goal: float | None,
+    scanner: Scanner,
+    *,
+    half_range: float,
+    tilt: float,
+    table_angles: tuple[float, ...],
+    ball_diameter: float,
+    images: int | None,
+    goal: float | None,
 ) -> Any:
     """The plan that tells a tilted scan's matrices best, within the given travel (mm, deg) and table angles (deg)."""
     from tomopose.planning.design import plan_poses
@@ -162,7 +190,10 @@ def poses(
         if geometry is None:
             raise typer.BadParameter("an optimal plan needs the scanner", param_hint="--scanner")
         given: dict[str, Any] = {
-            "half_range": half_range, "tilt": tilt, "table_angles": angles, "ball_diameter": ball_diameter
+            "half_range": half_range,
+            "tilt": tilt,
+            "table_angles": angles,
+            "ball_diameter": ball_diameter,
         }
         if purpose == "kinematic":
             if manipulator is None:
@@ -170,8 +201,11 @@ def poses(
             machine = tp.read_manipulator(manipulator)
             found = kinematic_poses(geometry, machine, images=images or KINEMATIC_IMAGES, spin=spin, **given)
             sequence = found.poses
-            summary |= {"trusted_px": found.trusted, "identified_px": found.identified,
-                        "identified_but_scale_px": found.but_scale}
+            summary |= {
+                "trusted_px": found.trusted,
+                "identified_px": found.identified,
+                "identified_but_scale_px": found.but_scale,
+            }
             lines.append(
                 f"  predicted scan error: {found.trusted:.3g} px if the poses are trusted, {found.identified:.3g} px "
                 "with the manipulator's errors identified from these images"
@@ -185,9 +219,14 @@ def poses(
             plan = best_poses(geometry, images=images, goal=goal, **given)
             sequence = plan.poses
             told = plan.resolved
-            summary |= {"predicted_px": plan.predicted, "paper_189_px": plan.reference, "u": dict(plan.u),
-                        "duration_s": plan.duration, "not_shown": [h.name for h in told.unresolved],
-                        "symmetries": [h.name for h in told.symmetric]}
+            summary |= {
+                "predicted_px": plan.predicted,
+                "paper_189_px": plan.reference,
+                "u": dict(plan.u),
+                "duration_s": plan.duration,
+                "not_shown": [h.name for h in told.unresolved],
+                "symmetries": [h.name for h in told.symmetric],
+            }
             lines.append(
                 f"  predicted scan reprojection error {plan.predicted:.4f} px (the paper's 189 poses: "
                 f"{plan.reference:.4f} px), about {plan.duration / 60:.0f} minutes"

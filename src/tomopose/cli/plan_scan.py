@@ -51,12 +51,15 @@ def scan(
     if shape == "circular":
         sequence = circular_scan(views)
     elif shape == "triangle":
-        wave = functools.partial(triangle_wave, amplitude=math.radians(8.0 if amplitude is None else amplitude),
-                                 periods=periods)
+        wave = functools.partial(
+            triangle_wave, amplitude=math.radians(8.0 if amplitude is None else amplitude), periods=periods
+        )
         sequence = tilted_scan(views, wave, R_HT=R_HT, pivot=pivot)
     elif shape == "sine":
         wave = functools.partial(
-            sine_wave, amplitude=math.radians(4.0 if amplitude is None else amplitude), periods=periods,
+            sine_wave,
+            amplitude=math.radians(4.0 if amplitude is None else amplitude),
+            periods=periods,
             offset=math.radians(1.0 if offset is None else offset),
         )
         sequence = tilted_scan(views, wave, R_HT=R_HT, pivot=pivot)

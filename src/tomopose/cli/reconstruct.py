@@ -77,9 +77,7 @@ def reconstruct(
     voxel: Annotated[float, typer.Option("--voxel-mm", help="Voxel side, mm.")],
     size: Annotated[str, typer.Option("--size", help="Voxels along each axis, N or NX,NY,NZ.")],
     out: Annotated[Path, typer.Option("--out", help="volume.h5 (also .nrrd, .mhd, .tif).")],
-    centre: Annotated[
-        str, typer.Option("--centre-mm", help="Middle of the volume in W, X,Y,Z.")
-    ] = "0,0,0",
+    centre: Annotated[str, typer.Option("--centre-mm", help="Middle of the volume in W, X,Y,Z.")] = "0,0,0",
     images_are: Annotated[
         str | None, typer.Option("--images-are", help="counts, transmission or line-integrals; never guessed.")
     ] = None,
@@ -114,13 +112,14 @@ def reconstruct(
         bool, typer.Option("--exclude-invalid", help="Leave NaN and dark pixels out of their view, not refuse them.")
     ] = False,
     scene: Annotated[
-        Path | None, typer.Option("--scene", help="scene.toml whose source and detector made the images, with "
-                                  "--material: beam hardening is taken out.")
+        Path | None,
+        typer.Option(
+            "--scene",
+            help="scene.toml whose source and detector made the images, with --material: beam hardening is taken out.",
+        ),
     ] = None,
     material: Annotated[str | None, typer.Option("--material", help="What the object is made of.")] = None,
-    thickness: Annotated[
-        float | None, typer.Option("--thickness-mm", help="Longest way through the object.")
-    ] = None,
+    thickness: Annotated[float | None, typer.Option("--thickness-mm", help="Longest way through the object.")] = None,
     mask: Annotated[
         Path | None, typer.Option("--mask", help="Volume on the same grid that is not 0 where there may be material.")
     ] = None,
@@ -162,9 +161,7 @@ def reconstruct(
     page = require_absent(out.with_name(f"{out.stem}.html"), force=force)
     P = tp.read_matrices(matrices)
     known = None if scanner is None else tp.read_scanner(scanner)
-    stack = open_for(
-        say, image_source(images), known, None, dark=dark, flat=flat, dataset=dataset, rows=rows, raw=raw
-    )
+    stack = open_for(say, image_source(images), known, None, dark=dark, flat=flat, dataset=dataset, rows=rows, raw=raw)
     bad = None if bad_pixels is None else tp.open_images(bad_pixels, rows=stack.rows)[0] != 0
     support = None
     if mask is not None:
@@ -173,17 +170,35 @@ def reconstruct(
             raise InputError(f"{mask}: its grid is not that of the volume to be made ({size} voxels of {voxel:g} mm)")
         support = allowed.values != 0
     choice: dict[str, Any] = {
-        "algorithm": algorithm, "iterations": iterations, "relaxation": relaxation, "order": order,
-        "subset_size": subset_size, "seed": seed,
+        "algorithm": algorithm,
+        "iterations": iterations,
+        "relaxation": relaxation,
+        "order": order,
+        "subset_size": subset_size,
+        "seed": seed,
     }
     if paper:
         choice = {**PAPER, "seed": seed}
     with say.progress("reconstructing") as progress, executor_of(dask) as client:
         volume = tp.reconstruct(
-            stack, P, grid, engine=engine, nonnegative=nonnegative, ring_width=ring_width, white=white, mask=support,
-            bad_pixels=bad, invalid="exclude" if exclude else "error", beam_hardening=coefficients,
+            stack,
+            P,
+            grid,
+            engine=engine,
+            nonnegative=nonnegative,
+            ring_width=ring_width,
+            white=white,
+            mask=support,
+            bad_pixels=bad,
+            invalid="exclude" if exclude else "error",
+            beam_hardening=coefficients,
             images_are="transmission" if flat is not None and images_are is None else images_are,
-            memory_gib=memory, scratch=scratch, checkpoint=checkpoint, progress=progress, client=client, **choice,
+            memory_gib=memory,
+            scratch=scratch,
+            checkpoint=checkpoint,
+            progress=progress,
+            client=client,
+            **choice,
         )
     made = provenance(
         inputs=[path for path in (matrices, scanner, bad_pixels, mask, scene) if path is not None],
@@ -197,10 +212,18 @@ def reconstruct(
     write_report(page, volume_report(volume))
     residual = None if volume.view_residual is None else float(np.median(volume.view_residual))
     say.result(
-        {"out": out.name, "shape_zyx": list(grid.shape), "voxel_mm": voxel, "median_view_residual": residual,
-         "notes": list(volume.notes), "settings": dict(volume.settings)},
-        [f"{out}: {' x '.join(map(str, grid.n_xyz))} voxels of {voxel:g} mm; pictures and {page.name} beside it",
-         *([] if residual is None else [f"  residual of a view's reprojection, median: {residual:.3g}"]),
-         *(f"  note: {note}" for note in volume.notes)],
+        {
+            "out": out.name,
+            "shape_zyx": list(grid.shape),
+            "voxel_mm": voxel,
+            "median_view_residual": residual,
+            "notes": list(volume.notes),
+            "settings": dict(volume.settings),
+        },
+        [
+            f"{out}: {' x '.join(map(str, grid.n_xyz))} voxels of {voxel:g} mm; pictures and {page.name} beside it",
+            *([] if residual is None else [f"  residual of a view's reprojection, median: {residual:.3g}"]),
+            *(f"  note: {note}" for note in volume.notes),
+        ],
     )
     return OK

@@ -50,7 +50,11 @@ def report(
     if calibration is not None:
         matrices = None if scan is None else tp.read_matrices(scan)
         html = calibration_report(
-            calibration, observations=observations, poses=sequence, thumbnails=pictures, scan=matrices,
+            calibration,
+            observations=observations,
+            poses=sequence,
+            thumbnails=pictures,
+            scan=matrices,
             history=() if history is None else read_history(history),
         )
     elif observations is not None:

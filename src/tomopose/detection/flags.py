@@ -69,9 +69,7 @@ def motion_length(anisotropy: Array, covariance: Array) -> float:
     return math.sqrt(24.0 * math.hypot(*anisotropy)) if significance > MOTION_CHI2 else 0.0
 
 
-def flags_of(
-    fit: ConeFit, *, saturated: float, expected: float, bright: bool, eight_bit: bool
-) -> tuple[str, ...]:
+def flags_of(fit: ConeFit, *, saturated: float, expected: float, bright: bool, eight_bit: bool) -> tuple[str, ...]:
     """The flags of one fit; DetectionError where the rim is mostly saturated or lost."""
     if saturated > MOSTLY_SATURATED:
         raise DetectionError(

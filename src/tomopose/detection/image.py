@@ -246,9 +246,7 @@ def _fitted(
     return fit, window, at
 
 
-def _ball_image(
-    fit: ConeFit, scanner: Scanner, flags: tuple[str, ...], candidates: tuple[Candidate, ...]
-) -> BallImage:
+def _ball_image(fit: ConeFit, scanner: Scanner, flags: tuple[str, ...], candidates: tuple[Candidate, ...]) -> BallImage:
     x_D = fit.shape[:2].copy()
     centre, major, minor, angle = silhouette_ellipse(scanner, x_D, fit.gamma)
     return BallImage(

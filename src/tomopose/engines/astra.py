@@ -50,9 +50,7 @@ class AstraEngine:
     name = "astra"
     limits = Limits(weights=("mean",), exact_transpose=False, most_voxels=2**40, device="cuda")
 
-    def __init__(
-        self, matrices: ProjectionMatrices, grid: VoxelGrid, *, support: np.ndarray | None = None
-    ) -> None:
+    def __init__(self, matrices: ProjectionMatrices, grid: VoxelGrid, *, support: np.ndarray | None = None) -> None:
         import astra
 
         self._astra = astra
@@ -114,8 +112,14 @@ class AstraEngine:
         return require_returned(volume, self.grid.shape, self.name)
 
     def back(
-        self, images: np.ndarray, views: Sequence[int], *, into: np.ndarray, weight: Weight = "mean",
-        scale: float = 1.0, nonnegative: bool = False,
+        self,
+        images: np.ndarray,
+        views: Sequence[int],
+        *,
+        into: np.ndarray,
+        weight: Weight = "mean",
+        scale: float = 1.0,
+        nonnegative: bool = False,
     ) -> None:
         if weight not in self.limits.weights:
             raise InputError(f"engine astra has the weight 'mean' only; {weight!r} was asked for")
@@ -137,7 +141,8 @@ def availability() -> Availability:
         return Availability(name="astra", available=False, reason=f"not installed ({error})", install_line=INSTALL)
     if not astra.use_cuda():
         return Availability(
-            name="astra", available=False,
+            name="astra",
+            available=False,
             reason=f"ASTRA {astra.__version__} is installed but finds no CUDA GPU; its CPU builds have no cone beam",
             install_line="install a CUDA driver, or use engine cpu",
         )

@@ -38,8 +38,13 @@ class CpuEngine:
     )
 
     def __init__(
-        self, matrices: ProjectionMatrices, grid: VoxelGrid, *, support: np.ndarray | None = None,
-        threads: int | None = None, kernels: Literal["vector", "plain"] = "vector",
+        self,
+        matrices: ProjectionMatrices,
+        grid: VoxelGrid,
+        *,
+        support: np.ndarray | None = None,
+        threads: int | None = None,
+        kernels: Literal["vector", "plain"] = "vector",
     ) -> None:
         if kernels not in ("vector", "plain"):
             raise InputError(f"kernels is {kernels!r}; 'vector' or 'plain' is needed")
@@ -52,7 +57,8 @@ class CpuEngine:
         self.matrices, self.grid = matrices, grid
         support = require_support(support, grid)
         self._support = (
-            np.zeros(0, dtype=np.uint8) if support is None
+            np.zeros(0, dtype=np.uint8)
+            if support is None
             else np.ascontiguousarray(support.transpose(2, 1, 0), dtype=np.uint8).reshape(-1)
         )
         self._layers = layers_of(support, grid)
@@ -82,18 +88,23 @@ class CpuEngine:
         for image, j in zip(lines, views, strict=True):
             source, M_inv = self._geometry.source[j], self._geometry.M_inv[j]
 
-            def part(start: int, stop: int, image: np.ndarray = image, s: np.ndarray = source,
-                     M: np.ndarray = M_inv) -> None:
-                kernels.forward_columns(
-                    flat, self.grid.n_xyz, self.grid.spacing, s, M, image, self.vector, start, stop
-                )
+            def part(
+                start: int, stop: int, image: np.ndarray = image, s: np.ndarray = source, M: np.ndarray = M_inv
+            ) -> None:
+                kernels.forward_columns(flat, self.grid.n_xyz, self.grid.spacing, s, M, image, self.vector, start, stop)
 
             self._share(part, self.matrices.n_u, RAY_COLUMNS)
         return lines.transpose(0, 2, 1)
 
     def back(
-        self, images: np.ndarray, views: Sequence[int], *, into: np.ndarray, weight: Weight = "sum",
-        scale: float = 1.0, nonnegative: bool = False,
+        self,
+        images: np.ndarray,
+        views: Sequence[int],
+        *,
+        into: np.ndarray,
+        weight: Weight = "sum",
+        scale: float = 1.0,
+        nonnegative: bool = False,
     ) -> None:
         images = require_images(images, views, self.matrices)
         if weight not in self.limits.weights:
@@ -110,8 +121,20 @@ class CpuEngine:
 
         def part(start: int, stop: int) -> None:
             kernels.back_columns(
-                flat, self.grid.n_xyz, P, pixels, (n_u, n_v), scale, weight == "inverse-square", weight == "mean",
-                nonnegative, self._support, self._layers, self.vector, start, stop,
+                flat,
+                self.grid.n_xyz,
+                P,
+                pixels,
+                (n_u, n_v),
+                scale,
+                weight == "inverse-square",
+                weight == "mean",
+                nonnegative,
+                self._support,
+                self._layers,
+                self.vector,
+                start,
+                stop,
             )
 
         self._share(part, self.grid.n_xyz[0], TILE)
@@ -125,11 +148,15 @@ class CpuEngine:
             source, M_inv = self._geometry.source[j], self._geometry.M_inv[j]
             for axis in range(3):
 
-                def part(start: int, stop: int, axis: int = axis, lines: np.ndarray = lines, s: np.ndarray = source,
-                         M: np.ndarray = M_inv) -> None:
-                    kernels.scatter_planes(
-                        flat, self.grid.n_xyz, self.grid.spacing, s, M, lines, axis, start, stop
-                    )
+                def part(
+                    start: int,
+                    stop: int,
+                    axis: int = axis,
+                    lines: np.ndarray = lines,
+                    s: np.ndarray = source,
+                    M: np.ndarray = M_inv,
+                ) -> None:
+                    kernels.scatter_planes(flat, self.grid.n_xyz, self.grid.spacing, s, M, lines, axis, start, stop)
 
                 n = self.grid.n_xyz[axis]
                 self._share(part, n, max(TILE, n // (2 * self.threads)))
@@ -143,7 +170,12 @@ class CpuEngine:
         lines = np.empty((len(views), self.matrices.n_u, self.matrices.n_v), dtype=np.float32)
         for image, j in zip(lines, views, strict=True):
             kernels.ray_lengths(
-                self.grid.n_xyz, self.grid.spacing, self._geometry.source[j], self._geometry.M_inv[j], image, 0,
+                self.grid.n_xyz,
+                self.grid.spacing,
+                self._geometry.source[j],
+                self._geometry.M_inv[j],
+                image,
+                0,
                 self.matrices.n_u,
             )
         return lines.transpose(0, 2, 1)

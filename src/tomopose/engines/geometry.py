@@ -47,8 +47,10 @@ def require_usable(matrices: ProjectionMatrices, grid: VoxelGrid) -> None:
         )
     u, v = h[:, 0] / depth, h[:, 1] / depth
     outside = (
-        (u.max(axis=1) < 0) | (u.min(axis=1) > matrices.n_u - 1)
-        | (v.max(axis=1) < 0) | (v.min(axis=1) > matrices.n_v - 1)
+        (u.max(axis=1) < 0)
+        | (u.min(axis=1) > matrices.n_u - 1)
+        | (v.max(axis=1) < 0)
+        | (v.min(axis=1) > matrices.n_v - 1)
     )
     missed = np.flatnonzero(outside)
     if missed.size:

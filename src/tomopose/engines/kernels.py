@@ -54,8 +54,14 @@ def seen_layers(P: Any, x: int, y: int, n_z: int, n_u: int, n_v: int) -> tuple[i
     top = n_z - 1
     u, v, w = a_u + b_u * top, a_v + b_v * top, a_w + b_w * top
     if (
-        a_u + a_w > 0.0 and u + w > 0.0 and n_u * a_w > a_u and n_u * w > u
-        and a_v + a_w > 0.0 and v + w > 0.0 and n_v * a_w > a_v and n_v * w > v
+        a_u + a_w > 0.0
+        and u + w > 0.0
+        and n_u * a_w > a_u
+        and n_u * w > u
+        and a_v + a_w > 0.0
+        and v + w > 0.0
+        and n_v * a_w > a_v
+        and n_v * w > v
     ):
         return 0, n_z
     low, high = _clip_range(-1.0, float(n_z), a_u + a_w, b_u + b_w)
@@ -67,7 +73,16 @@ def seen_layers(P: Any, x: int, y: int, n_z: int, n_u: int, n_v: int) -> tuple[i
 
 @njit(cache=True, nogil=True)
 def _back_column_vector(
-    column: Any, at: int, P: Any, x: int, y: int, z_0: int, z_1: int, image: Any, row: int, scale: float,
+    column: Any,
+    at: int,
+    P: Any,
+    x: int,
+    y: int,
+    z_0: int,
+    z_1: int,
+    image: Any,
+    row: int,
+    scale: float,
     inverse_square: bool,
 ) -> None:
     """Add one view to layers z_0 <= z < z_1 of a column that begins at column[at]; the column has at least W layers."""
@@ -95,20 +110,51 @@ def _back_column_vector(
         u, v, w = a_u + b_u * start, a_v + b_v * start, a_w + P[2, 2] * start
         if inverse_square:
             back_block_inverse_square(
-                column, at + start, image, base, np.int32(row), np.int32(first), F32(scale), F32(u), F32(b_u), F32(v),
-                F32(b_v), F32(w), F32(P[2, 2]),
+                column,
+                at + start,
+                image,
+                base,
+                np.int32(row),
+                np.int32(first),
+                F32(scale),
+                F32(u),
+                F32(b_u),
+                F32(v),
+                F32(b_v),
+                F32(w),
+                F32(P[2, 2]),
             )
         else:
             back_block(
-                column, at + start, image, base, np.int32(row), np.int32(first), F32(scale), F32(u), F32(b_u), F32(v),
-                F32(b_v), F32(w), F32(P[2, 2]),
+                column,
+                at + start,
+                image,
+                base,
+                np.int32(row),
+                np.int32(first),
+                F32(scale),
+                F32(u),
+                F32(b_u),
+                F32(v),
+                F32(b_v),
+                F32(w),
+                F32(P[2, 2]),
             )
         z = start + W
 
 
 @njit(cache=True, nogil=True)
 def _back_column_plain(
-    column: Any, at: int, P: Any, x: int, y: int, z_0: int, z_1: int, image: Any, row: int, scale: float,
+    column: Any,
+    at: int,
+    P: Any,
+    x: int,
+    y: int,
+    z_0: int,
+    z_1: int,
+    image: Any,
+    row: int,
+    scale: float,
     inverse_square: bool,
 ) -> None:
     """The same without vectors."""
@@ -129,8 +175,20 @@ def _back_column_plain(
 
 @njit(cache=True, nogil=True)
 def back_columns(
-    volume: Any, shape: Any, P: Any, images: Any, detector: Any, scale: float, inverse_square: bool, mean: bool,
-    nonnegative: bool, support: Any, layers: Any, vector: bool, x_0: int, x_1: int,
+    volume: Any,
+    shape: Any,
+    P: Any,
+    images: Any,
+    detector: Any,
+    scale: float,
+    inverse_square: bool,
+    mean: bool,
+    nonnegative: bool,
+    support: Any,
+    layers: Any,
+    vector: bool,
+    x_0: int,
+    x_1: int,
 ) -> None:
     """Add views to the columns x_0 <= x < x_1 of a volume.
 
@@ -170,13 +228,9 @@ def back_columns(
                     column, start = (sums, 0) if many else (volume, at)
                     factor = 1.0 if many else scale
                     if vector:
-                        _back_column_vector(
-                            column, start, P[j], x, y, z_0, z_1, images[j], row, factor, inverse_square
-                        )
+                        _back_column_vector(column, start, P[j], x, y, z_0, z_1, images[j], row, factor, inverse_square)
                     else:
-                        _back_column_plain(
-                            column, start, P[j], x, y, z_0, z_1, images[j], row, factor, inverse_square
-                        )
+                        _back_column_plain(column, start, P[j], x, y, z_0, z_1, images[j], row, factor, inverse_square)
                 if many:
                     seen = 0
                     for z in range(n_z):
@@ -221,7 +275,17 @@ def _ray(source: Any, d: Any, axis: int, shape: Any) -> tuple[int, int, float, f
 
 @njit(cache=True, nogil=True)
 def _walk(
-    volume: Any, start: int, s_k: int, s_a: int, s_b: int, k_0: int, k_1: int, a: float, da: float, b: float, db: float,
+    volume: Any,
+    start: int,
+    s_k: int,
+    s_a: int,
+    s_b: int,
+    k_0: int,
+    k_1: int,
+    a: float,
+    da: float,
+    b: float,
+    db: float,
 ) -> float:
     """Joseph's sum along one ray, any axis."""
     total: Any = F32(0.0)
@@ -297,8 +361,18 @@ def forward_columns(
                 if k_1 > k_0:
                     other = 1 - axis
                     forward_block(
-                        volume, start, strides[axis], np.int32(strides[other]), rays, k_0, k_1,
-                        F32(0.5 * (shape[axis] - 1)), F32(shape[other]), F32(n_z), sums, 0,
+                        volume,
+                        start,
+                        strides[axis],
+                        np.int32(strides[other]),
+                        rays,
+                        k_0,
+                        k_1,
+                        F32(0.5 * (shape[axis] - 1)),
+                        F32(shape[other]),
+                        F32(n_z),
+                        sums,
+                        0,
                     )
                 for lane in range(count):
                     image[u, v + lane] = sums[lane] * steps[lane]

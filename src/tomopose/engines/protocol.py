@@ -71,7 +71,13 @@ class Engine(Protocol):
         """Line integrals (m, n_v, n_u) of the volume: A x."""
 
     def back(
-        self, images: np.ndarray, views: Sequence[int], *, into: State, weight: Weight = "sum", scale: float = 1.0,
+        self,
+        images: np.ndarray,
+        views: Sequence[int],
+        *,
+        into: State,
+        weight: Weight = "sum",
+        scale: float = 1.0,
         nonnegative: bool = False,
     ) -> None:
         """Add scale times the voxel-driven back-projection of images to `into`; with `nonnegative` cut it at 0 then."""

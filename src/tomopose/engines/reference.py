@@ -27,13 +27,9 @@ class ReferenceEngine:
     """Joseph's projector and bilinear voxel-driven back-projection, written as their definitions."""
 
     name = "reference"
-    limits = Limits(
-        weights=("sum", "mean", "inverse-square"), exact_transpose=True, most_voxels=256**3, device="cpu"
-    )
+    limits = Limits(weights=("sum", "mean", "inverse-square"), exact_transpose=True, most_voxels=256**3, device="cpu")
 
-    def __init__(
-        self, matrices: ProjectionMatrices, grid: VoxelGrid, *, support: np.ndarray | None = None
-    ) -> None:
+    def __init__(self, matrices: ProjectionMatrices, grid: VoxelGrid, *, support: np.ndarray | None = None) -> None:
         self.matrices, self.grid = matrices, grid
         self._support = require_support(support, grid)
         self._rays = matrices.decompose()
@@ -95,8 +91,14 @@ class ReferenceEngine:
         return total.reshape(self.grid.shape)
 
     def back(
-        self, images: np.ndarray, views: Sequence[int], *, into: np.ndarray, weight: Weight = "sum",
-        scale: float = 1.0, nonnegative: bool = False,
+        self,
+        images: np.ndarray,
+        views: Sequence[int],
+        *,
+        into: np.ndarray,
+        weight: Weight = "sum",
+        scale: float = 1.0,
+        nonnegative: bool = False,
     ) -> None:
         images = require_images(images, views, self.matrices)
         n_u, n_v = self.matrices.n_u, self.matrices.n_v

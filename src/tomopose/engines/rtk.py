@@ -85,9 +85,7 @@ class RtkEngine:
         weights=("sum", "mean", "inverse-square"), exact_transpose=True, most_voxels=2**31 - 1, device="cpu"
     )
 
-    def __init__(
-        self, matrices: ProjectionMatrices, grid: VoxelGrid, *, support: np.ndarray | None = None
-    ) -> None:
+    def __init__(self, matrices: ProjectionMatrices, grid: VoxelGrid, *, support: np.ndarray | None = None) -> None:
         self._itk, self._rtk = load_itk()
         self._kind = self._itk.Image[self._itk.F, 3]
         self.matrices, self.grid = matrices, grid
@@ -143,14 +141,18 @@ class RtkEngine:
 
     def transpose(self, images: np.ndarray, views: Sequence[int]) -> np.ndarray:
         images = require_images(images, views, self.matrices)
-        volume = self.run(
-            "JosephBackProjectionImageFilter", volume=self.empty(), images=images, views=views, back=True
-        )
+        volume = self.run("JosephBackProjectionImageFilter", volume=self.empty(), images=images, views=views, back=True)
         return require_returned(volume, self.empty().shape, self.name)
 
     def back(
-        self, images: np.ndarray, views: Sequence[int], *, into: np.ndarray, weight: Weight = "sum",
-        scale: float = 1.0, nonnegative: bool = False,
+        self,
+        images: np.ndarray,
+        views: Sequence[int],
+        *,
+        into: np.ndarray,
+        weight: Weight = "sum",
+        scale: float = 1.0,
+        nonnegative: bool = False,
     ) -> None:
         images = require_images(images, views, self.matrices)
         if weight not in self.limits.weights:

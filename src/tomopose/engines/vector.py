@@ -108,9 +108,7 @@ def _near(builder: Any, data: Any, start: Any, row: Any, d_a: Any, d_b: Any, row
     if rows == 2:
         return (*picked[0], *picked[1])
     upper = builder.icmp_unsigned("==", d_a, one)
-    return tuple(
-        builder.select(upper, picked[r + 1][side], picked[r][side]) for r in (0, 1) for side in (0, 1)
-    )
+    return tuple(builder.select(upper, picked[r + 1][side], picked[r][side]) for r in (0, 1) for side in (0, 1))
 
 
 def _neighbours(builder: Any, data: Any, count: Any, base: Any, row: Any, i_a: Any, i_b: Any) -> tuple[Any, ...]:
@@ -174,8 +172,20 @@ def _bilinear(builder: Any, data: Any, count: Any, base: Any, row: Any, a: Any, 
 def _back_block(inverse_square: bool) -> Any:
     @intrinsic
     def block(
-        typingctx: Any, column: Any, z: Any, image: Any, base: Any, row: Any, first: Any, scale: Any,
-        u: Any, du: Any, v: Any, dv: Any, w: Any, dw: Any,
+        typingctx: Any,
+        column: Any,
+        z: Any,
+        image: Any,
+        base: Any,
+        row: Any,
+        first: Any,
+        scale: Any,
+        u: Any,
+        du: Any,
+        v: Any,
+        dv: Any,
+        w: Any,
+        dw: Any,
     ) -> Any:
         """column[z + l] += weight * image at ((u + l du) / (w + l dw), (v + l dv) / (w + l dw)), lanes first <= l < W.
 
@@ -199,8 +209,13 @@ def _back_block(inverse_square: bool) -> Any:
 
             reciprocal = builder.fdiv(ir.Constant(VF, [1.0] * W), along(w, dw))
             value = _bilinear(
-                builder, pixels, _count(context, builder, signature.args[2], image), base, row,
-                builder.fmul(along(u, du), reciprocal), builder.fmul(along(v, dv), reciprocal),
+                builder,
+                pixels,
+                _count(context, builder, signature.args[2], image),
+                base,
+                row,
+                builder.fmul(along(u, du), reciprocal),
+                builder.fmul(along(v, dv), reciprocal),
             )
             weight = _splat(builder, scale)
             if inverse_square:
@@ -221,8 +236,19 @@ back_block_inverse_square = _back_block(inverse_square=True)
 
 @intrinsic
 def forward_block(
-    typingctx: Any, volume: Any, base: Any, plane: Any, row: Any, rays: Any, k_0: Any, k_1: Any, centre: Any,
-    a_end: Any, b_end: Any, sums: Any, at: Any,
+    typingctx: Any,
+    volume: Any,
+    base: Any,
+    plane: Any,
+    row: Any,
+    rays: Any,
+    k_0: Any,
+    k_1: Any,
+    centre: Any,
+    a_end: Any,
+    b_end: Any,
+    sums: Any,
+    at: Any,
 ) -> Any:
     """sums[at + l] = sum over planes k_0 <= k < k_1 of the volume at (a_l(k), b_l(k)): Joseph's sum for W rays.
 
@@ -231,8 +257,18 @@ def forward_block(
     within [-1, a_end] and [-1, b_end], where the volume's margin is zero.
     """
     signature = types.void(
-        volume, types.int64, types.int64, types.int32, rays, types.int64, types.int64, types.float32, types.float32,
-        types.float32, sums, types.int64,
+        volume,
+        types.int64,
+        types.int64,
+        types.int32,
+        rays,
+        types.int64,
+        types.int64,
+        types.float32,
+        types.float32,
+        types.float32,
+        sums,
+        types.int64,
     )
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

@@ -52,6 +52,4 @@ def from_cil(content: Mapping[str, Any], given: Given, *, where: str = "the CIL 
         p_v=given.settle("p_v", float(pitch[1]), where),
         pose_id=given.pose_id,
     )
-    return matrices_of_panels(
-        source, detector, pitch[0] * x, pitch[1] * y, given=settled, rows="bottom", where=where
-    )
+    return matrices_of_panels(source, detector, pitch[0] * x, pitch[1] * y, given=settled, rows="bottom", where=where)

@@ -29,9 +29,7 @@ def zyx_angles(R: Array) -> Array:
     """(n, 3): a, b, c with R = R_z(a) R_y(b) R_x(c)."""
     a = np.arctan2(R[:, 1, 0], R[:, 0, 0])
     rest = _without_z(R, a)
-    return np.stack(
-        [a, np.arctan2(-rest[:, 2, 0], rest[:, 0, 0]), np.arctan2(-rest[:, 1, 2], rest[:, 1, 1])], axis=1
-    )
+    return np.stack([a, np.arctan2(-rest[:, 2, 0], rest[:, 0, 0]), np.arctan2(-rest[:, 1, 2], rest[:, 1, 1])], axis=1)
 
 
 def zxy_angles(R: Array) -> Array:

@@ -126,8 +126,15 @@ def _parameters(matrices: ProjectionMatrices) -> tuple[dict[str, Array], tuple[f
     n = np.cross(U, V)
     in_plane, out_of_plane, gantry = np.degrees(-zxy_angles(np.stack([U, V, n], axis=1))).T % 360.0
     values = (
-        np.einsum("ni,ni->n", n, S), g.d_SD, gantry, np.einsum("ni,ni->n", C, U), np.einsum("ni,ni->n", C, V),
-        in_plane, out_of_plane, np.einsum("ni,ni->n", S, U), np.einsum("ni,ni->n", S, V),
+        np.einsum("ni,ni->n", n, S),
+        g.d_SD,
+        gantry,
+        np.einsum("ni,ni->n", C, U),
+        np.einsum("ni,ni->n", C, V),
+        in_plane,
+        out_of_plane,
+        np.einsum("ni,ni->n", S, U),
+        np.einsum("ni,ni->n", S, V),
     )
     origin = (-(matrices.n_u - 1) / 2 * matrices.p_u, -(matrices.n_v - 1) / 2 * matrices.p_v)
     return dict(zip(PARAMETERS, values, strict=True)), origin

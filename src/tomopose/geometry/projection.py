@@ -60,7 +60,11 @@ def project_ball(
 
 
 def eq5_matrices(
-    scanner: Scanner, *, T_HT: RigidTransform, T_MH: RigidTransform, alpha: Array | float = 0.0,
+    scanner: Scanner,
+    *,
+    T_HT: RigidTransform,
+    T_MH: RigidTransform,
+    alpha: Array | float = 0.0,
     home: RigidTransform | None = None,
 ) -> Array:
     """The matrices P_j (n, 3, 4) that take points of W, object at home, to pixels.  Eq. (5).
@@ -128,9 +132,7 @@ class ViewGeometry:
         return n * sign[:, None]
 
 
-def decompose(
-    P: Any, *, n_u: int, n_v: int, p_u: float, p_v: float, in_front: Any = (0.0, 0.0, 0.0)
-) -> ViewGeometry:
+def decompose(P: Any, *, n_u: int, n_v: int, p_u: float, p_v: float, in_front: Any = (0.0, 0.0, 0.0)) -> ViewGeometry:
     """Source and panel of matrices P (n, 3, 4), given the panel's size and pitch; in_front as in `canonical`.
 
     P alone fixes only d_SD / pitch.  A matrix with skew or with an aspect that differs from p_u / p_v has no flat panel
@@ -238,9 +240,7 @@ class ProjectionMatrices:
 
     def decompose(self) -> ViewGeometry:
         """Source and panel of each view."""
-        return decompose(
-            self.P, n_u=self.n_u, n_v=self.n_v, p_u=self.p_u, p_v=self.p_v, in_front=self.in_front
-        )
+        return decompose(self.P, n_u=self.n_u, n_v=self.n_v, p_u=self.p_u, p_v=self.p_v, in_front=self.in_front)
 
     def top_first(self) -> Array:
         """The matrices for arrays whose row 0 is the top: F P."""
@@ -261,8 +261,9 @@ class ProjectionMatrices:
         """The matrices for images averaged over factor x factor pixels, by the rule of `Scanner.binned`."""
         if int(factor) != factor or factor < 1:
             raise InputError(f"binning factor is {factor!r}; a positive whole number is needed")
-        B = np.array([[1 / factor, 0, -(factor - 1) / 2 / factor], [0, 1 / factor, -(factor - 1) / 2 / factor],
-                      [0, 0, 1.0]])
+        B = np.array(
+            [[1 / factor, 0, -(factor - 1) / 2 / factor], [0, 1 / factor, -(factor - 1) / 2 / factor], [0, 0, 1.0]]
+        )
         return replace(
             self,
             P=B @ self.P,

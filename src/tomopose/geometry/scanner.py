@@ -169,8 +169,10 @@ class Scanner:
         """Table to world at table angle alpha (rad): a turn about the table axis, the identity at 0.  Paper sec. 3."""
         alpha = np.asarray(alpha, dtype=np.float64)
         turn = RigidTransform(R=R_z(alpha), t=np.zeros((*alpha.shape, 3)), source=Frame.W, target=Frame.W)
-        moved = turn if self.axis_y == self.axis_tilt_x == self.axis_tilt_y == 0.0 else (
-            self.table_axis @ turn @ self.table_axis.inv
+        moved = (
+            turn
+            if self.axis_y == self.axis_tilt_x == self.axis_tilt_y == 0.0
+            else (self.table_axis @ turn @ self.table_axis.inv)
         )
         return RigidTransform(R=moved.R, t=moved.t, source=Frame.T, target=Frame.W)
 
@@ -183,8 +185,10 @@ class Scanner:
         if int(factor) != factor or factor < 1:
             raise InputError(f"binning factor is {factor!r}; a positive whole number is needed")
         shift = (factor - 1) / 2
-        sigma = {k: s / factor if k in ("u_0", "v_0") else s * (factor if k in ("p_u", "p_v") else 1)
-                 for k, s in self.sigma.items()}
+        sigma = {
+            k: s / factor if k in ("u_0", "v_0") else s * (factor if k in ("p_u", "p_v") else 1)
+            for k, s in self.sigma.items()
+        }
         return replace(
             self,
             p_u=self.p_u * factor,

@@ -140,7 +140,9 @@ def _calibration(document: Mapping[str, Any], where: str) -> Calibration:
         dof=int(document["dof"]),
         parameters=tuple(
             Parameter(
-                name=p["name"], value=float(decode_array(p["value"])), u=float(decode_array(p["standard_uncertainty"])),
+                name=p["name"],
+                value=float(decode_array(p["value"])),
+                u=float(decode_array(p["standard_uncertainty"])),
                 unit=p["unit"],
             )
             for p in document["parameters"]

@@ -92,10 +92,12 @@ def _variance(table: TextTable, column: str, unseen: Sequence[bool]) -> Array:
     for i in np.flatnonzero(sigma <= 0):
         raise InputError(f"{table.where(int(i), column)}: sigma is {sigma[i]:g} px; it must be above 0")
     k = table.columns.index(column)
-    return np.array([
-        np.nan if np.isnan(s) else variance_from_cell(table.digits(row[k]))
-        for s, row in zip(sigma, table.rows, strict=True)
-    ])
+    return np.array(
+        [
+            np.nan if np.isnan(s) else variance_from_cell(table.digits(row[k]))
+            for s, row in zip(sigma, table.rows, strict=True)
+        ]
+    )
 
 
 def variance_from_cell(cell: str) -> float:

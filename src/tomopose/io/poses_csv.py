@@ -95,9 +95,7 @@ def poses_from_table(
         if turning and not confirmed:
             values = np.column_stack([table.numbers(c) for c in turning])
             unit_checks.require_joint_degrees(values, f"{table.path}: {turning[0]} ... {turning[-1]}")
-        q = np.column_stack([
-            np.radians(table.numbers(c)) if c.endswith("_deg") else table.numbers(c) for c in joints
-        ])
+        q = np.column_stack([np.radians(table.numbers(c)) if c.endswith("_deg") else table.numbers(c) for c in joints])
         if measured is None and commanded is None and forward is not None:
             measured = forward(q)
     if measured is None and commanded is None:
@@ -314,8 +312,13 @@ def _warn_if_far(table: TextTable, measured: RigidTransform, commanded: RigidTra
 
 
 def write_poses(
-    path: str | Path, poses: PoseSequence, *, convention: str | None = None, comments: Iterable[tuple[str, str]] = (),
-    joint_units: Sequence[str] = (), force: bool = False,
+    path: str | Path,
+    poses: PoseSequence,
+    *,
+    convention: str | None = None,
+    comments: Iterable[tuple[str, str]] = (),
+    joint_units: Sequence[str] = (),
+    force: bool = False,
 ) -> None:
     """Write poses.csv in a named convention (default: the one the poses came in), floats with all their digits.
 

@@ -147,7 +147,10 @@ def _refuse(key: str, where: str) -> None:
 
 def _require_units(values: Mapping[str, float], where: str) -> None:
     for name, (low, high) in {
-        "p_u": PITCH_RANGE, "p_v": PITCH_RANGE, "d_SD": DISTANCE_RANGE, "d_SR": (0.0, DISTANCE_RANGE[1])
+        "p_u": PITCH_RANGE,
+        "p_v": PITCH_RANGE,
+        "d_SD": DISTANCE_RANGE,
+        "d_SR": (0.0, DISTANCE_RANGE[1]),
     }.items():
         value = values[name]
         if 0 < value < low or value > high:

@@ -143,7 +143,11 @@ def read_table(path: str | Path) -> TextTable:
     if twice:
         raise InputError(f"{path}: column {twice[0]!r} stands more than once")
     return TextTable(
-        path=path, comments=comments, columns=header, rows=tuple(rows), lines=tuple(lines),
+        path=path,
+        comments=comments,
+        columns=header,
+        rows=tuple(rows),
+        lines=tuple(lines),
         decimal_comma=_has_decimal_commas(path, separator, rows),
     )
 

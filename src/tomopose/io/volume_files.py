@@ -31,8 +31,13 @@ def write_volume(volume: Volume, path: str | Path, *, force: bool = False) -> Pa
     and `force` is not given.
     """
     path = Path(path)
-    writer = {".h5": _write_hdf5, ".tif": _write_tiff, ".tiff": _write_tiff, ".nrrd": _write_nrrd,
-              ".mhd": _write_metaimage}.get(path.suffix.lower())
+    writer = {
+        ".h5": _write_hdf5,
+        ".tif": _write_tiff,
+        ".tiff": _write_tiff,
+        ".nrrd": _write_nrrd,
+        ".mhd": _write_metaimage,
+    }.get(path.suffix.lower())
     if writer is None:
         raise FileError(f"{path}: {path.suffix!r} is no volume format; {', '.join(SUFFIXES)} are known", path=path)
     require_absent(path, force=force)
@@ -48,8 +53,13 @@ def read_volume(path: str | Path) -> Volume:
     Raises FileError where the file is missing, of another suffix or damaged, SchemaVersionError for another schema.
     """
     path = Path(path)
-    reader = {".h5": _read_hdf5, ".tif": _read_tiff, ".tiff": _read_tiff, ".nrrd": _read_nrrd,
-              ".mhd": _read_metaimage}.get(path.suffix.lower())
+    reader = {
+        ".h5": _read_hdf5,
+        ".tif": _read_tiff,
+        ".tiff": _read_tiff,
+        ".nrrd": _read_nrrd,
+        ".mhd": _read_metaimage,
+    }.get(path.suffix.lower())
     if reader is None:
         raise FileError(f"{path}: {path.suffix!r} is no volume format; {', '.join(SUFFIXES)} are known", path=path)
     if not path.is_file():
@@ -98,14 +108,19 @@ def _read_hdf5(path: Path) -> Volume:
         if dataset.attrs["frame"] != "W" or dataset.attrs["axes"] != "z,y,x":
             raise FileError(
                 f"{path}: frame {dataset.attrs['frame']!r} and axes {dataset.attrs['axes']!r}; 'W' and 'z,y,x' are "
-                "needed", path=path,
+                "needed",
+                path=path,
             )
         grid = _grid(dataset.shape, dataset.attrs["spacing_mm"], dataset.attrs["origin_mm"])
         residual = file["view_residual"][()] if "view_residual" in file else None
         notes, settings = json.loads(file.attrs["notes"]), json.loads(file.attrs["settings"])
         block = json.loads(file.attrs["provenance"]) if "provenance" in file.attrs else None
     return Volume(
-        values=mapped(path), grid=grid, view_residual=residual, notes=tuple(notes), settings=settings,
+        values=mapped(path),
+        grid=grid,
+        view_residual=residual,
+        notes=tuple(notes),
+        settings=settings,
         provenance=None if block is None else Provenance.from_json(block),
     )
 
@@ -117,15 +132,25 @@ def _write_tiff(volume: Volume, path: Path) -> None:
     """One page a layer; the geometry as JSON in the first page's description."""
     description = json.dumps(
         {
-            "schema": SCHEMA, "frame": "W", "axes": "z,y,x", "unit": "1/mm",
-            "spacing_mm": volume.grid.spacing.tolist(), "origin_mm": volume.grid.origin.tolist(),
+            "schema": SCHEMA,
+            "frame": "W",
+            "axes": "z,y,x",
+            "unit": "1/mm",
+            "spacing_mm": volume.grid.spacing.tolist(),
+            "origin_mm": volume.grid.origin.tolist(),
         }
     )
     layers = (np.ascontiguousarray(layer, dtype=np.float32) for layer in volume.values)
     with atomic_file(path) as temporary:
         tifffile.imwrite(
-            temporary, layers, shape=volume.values.shape, dtype=np.float32, photometric="minisblack",
-            description=description, metadata=None, bigtiff=volume.values.nbytes > 2**32 - 2**25,
+            temporary,
+            layers,
+            shape=volume.values.shape,
+            dtype=np.float32,
+            photometric="minisblack",
+            description=description,
+            metadata=None,
+            bigtiff=volume.values.nbytes > 2**32 - 2**25,
         )
 
 
@@ -136,9 +161,7 @@ def _read_tiff(path: Path) -> Volume:
         if description.get("schema") != SCHEMA:
             raise SchemaVersionError(f"{path}: the first page does not say {SCHEMA!r}", path=path)
         values = np.stack([page.asarray() for page in file.pages])
-    return Volume(
-        values=values, grid=_grid(values.shape, description["spacing_mm"], description["origin_mm"])
-    )
+    return Volume(values=values, grid=_grid(values.shape, description["spacing_mm"], description["origin_mm"]))
 
 
 # -- NRRD (teem.sourceforge.net/nrrd/format.html) and MetaImage (itk.org/Wiki/ITK/MetaIO/Documentation) ----------------
@@ -159,10 +182,19 @@ def _write_nrrd(volume: Volume, path: Path) -> None:
     s_x, s_y, s_z = _numbers(grid.spacing)
     header = "\n".join(
         [
-            "NRRD0004", "type: float", "dimension: 3", "space: 3D-right-handed", f"sizes: {n_x} {n_y} {n_z}",
-            f"space directions: ({s_x},0,0) (0,{s_y},0) (0,0,{s_z})", "kinds: domain domain domain",
-            'space units: "mm" "mm" "mm"', f"space origin: ({','.join(_numbers(grid.origin))})", "endian: little",
-            "encoding: raw", "", "",
+            "NRRD0004",
+            "type: float",
+            "dimension: 3",
+            "space: 3D-right-handed",
+            f"sizes: {n_x} {n_y} {n_z}",
+            f"space directions: ({s_x},0,0) (0,{s_y},0) (0,0,{s_z})",
+            "kinds: domain domain domain",
+            'space units: "mm" "mm" "mm"',
+            f"space origin: ({','.join(_numbers(grid.origin))})",
+            "endian: little",
+            "encoding: raw",
+            "",
+            "",
         ]
     )
     with atomic_file(path) as temporary, open(temporary, "wb") as stream:
@@ -196,11 +228,18 @@ def _write_metaimage(volume: Volume, path: Path) -> None:
         _write_raw(stream, volume.values)
     header = "\n".join(
         [
-            "ObjectType = Image", "NDims = 3", "BinaryData = True", "BinaryDataByteOrderMSB = False",
-            "CompressedData = False", "TransformMatrix = 1 0 0 0 1 0 0 0 1",
-            f"Offset = {' '.join(_numbers(grid.origin))}", f"ElementSpacing = {' '.join(_numbers(grid.spacing))}",
-            f"DimSize = {' '.join(str(n) for n in grid.n_xyz)}", "ElementType = MET_FLOAT",
-            f"ElementDataFile = {raw.name}", "",
+            "ObjectType = Image",
+            "NDims = 3",
+            "BinaryData = True",
+            "BinaryDataByteOrderMSB = False",
+            "CompressedData = False",
+            "TransformMatrix = 1 0 0 0 1 0 0 0 1",
+            f"Offset = {' '.join(_numbers(grid.origin))}",
+            f"ElementSpacing = {' '.join(_numbers(grid.spacing))}",
+            f"DimSize = {' '.join(str(n) for n in grid.n_xyz)}",
+            "ElementType = MET_FLOAT",
+            f"ElementDataFile = {raw.name}",
+            "",
         ]
     )
     with atomic_file(path) as temporary:

@@ -112,8 +112,12 @@ def machine_from_block(kind: str, nominal: Mapping[str, Any], where: str) -> Err
         return InverseManipulator(machine=machine_from_block(nominal["kind"], nominal["machine"], where))
     if kind == "map":
         return PoseMap(
-            order=int(nominal["order"]), t_scale=nominal["t_scale_mm"], w_scale=nominal["w_scale_rad"],
-            t_sigma=nominal["t_sigma_mm"], w_sigma=nominal["w_sigma_rad"], factors=nominal.get("factors"),
+            order=int(nominal["order"]),
+            t_scale=nominal["t_scale_mm"],
+            w_scale=nominal["w_scale_rad"],
+            t_sigma=nominal["t_sigma_mm"],
+            w_sigma=nominal["w_sigma_rad"],
+            factors=nominal.get("factors"),
             repeatability=Repeatability(**nominal["repeatability"]),
         )
     raise InputError(f"{where} has kind {kind!r}; hexapod, serial, map and inverse are known")
@@ -126,7 +130,8 @@ def machines_of(manipulator: Mapping[str, Any]) -> tuple[ErrorModel | None, Erro
     if manipulator.get("kind") == "twin":
         twins = {
             who: machine_from_block(block["kind"], {k: v for k, v in block.items() if k != "kind"}, where)
-            for who, block in nominal.items() if who in ("detector", "source")
+            for who, block in nominal.items()
+            if who in ("detector", "source")
         }
         return twins.get("detector"), twins.get("source")
     if "kind" not in manipulator:

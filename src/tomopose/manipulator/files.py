@@ -23,12 +23,34 @@ LARGEST_JOINT_SIGMA_MM = 20.0
 CONFIRM = 'convert them, or add "units": "confirmed" if the numbers are right'
 
 HEXAPOD_KEYS = (
-    "schema", "base_joints_mm", "platform_joints_mm", "joint_sigma_mm", "leg_sigma_mm", "scale_sigma", "geometry_sigma",
-    "leg_scale_sigma", "axes_sigma_rad", "pivot_sigma_mm", "leg_limits_mm", "repeatability", "units", "name", "comment",
+    "schema",
+    "base_joints_mm",
+    "platform_joints_mm",
+    "joint_sigma_mm",
+    "leg_sigma_mm",
+    "scale_sigma",
+    "geometry_sigma",
+    "leg_scale_sigma",
+    "axes_sigma_rad",
+    "pivot_sigma_mm",
+    "leg_limits_mm",
+    "repeatability",
+    "units",
+    "name",
+    "comment",
     "provenance",
 )
 SERIAL_KEYS = (
-    "schema", "convention", "joints", "tool", "q_start_deg", "repeatability", "units", "name", "comment", "provenance",
+    "schema",
+    "convention",
+    "joints",
+    "tool",
+    "q_start_deg",
+    "repeatability",
+    "units",
+    "name",
+    "comment",
+    "provenance",
 )
 JOINT_KEYS = ("a_mm", "alpha_deg", "d_mm", "theta_offset_deg", "kind", "sigma", "name")
 
@@ -87,8 +109,12 @@ def hexapod_from_document(document: Mapping[str, Any], where: str) -> Hexapod:
     sigma = {
         key: _number(document, key, default, where)
         for key, default in (
-            ("joint_sigma_mm", 0.1), ("leg_sigma_mm", 0.1), ("scale_sigma", 0.05), ("geometry_sigma", 0.05),
-            ("leg_scale_sigma", 0.0), ("axes_sigma_rad", 0.0),
+            ("joint_sigma_mm", 0.1),
+            ("leg_sigma_mm", 0.1),
+            ("scale_sigma", 0.05),
+            ("geometry_sigma", 0.05),
+            ("leg_scale_sigma", 0.0),
+            ("axes_sigma_rad", 0.0),
             ("pivot_sigma_mm", 0.0),
         )
     }
@@ -168,8 +194,12 @@ def _joint(block: Any, where: str, confirmed: bool) -> Joint:
         number = _finite(value, f"sigma {key}", where)
         sigma[name] = number if wanted == "mm" else float(np.radians(number))
     return Joint(
-        a=numbers["a_mm"], alpha=float(np.radians(numbers["alpha_deg"])), d=numbers["d_mm"],
-        theta_offset=float(np.radians(offset)), kind=kind, sigma=sigma,
+        a=numbers["a_mm"],
+        alpha=float(np.radians(numbers["alpha_deg"])),
+        d=numbers["d_mm"],
+        theta_offset=float(np.radians(offset)),
+        kind=kind,
+        sigma=sigma,
     )
 
 

@@ -36,16 +36,27 @@ from tomopose.units import Array, float_array
 NEWTON_STEPS = 30
 NEWTON_TOLERANCE = 1e-11
 """mm in the legs; rounding of lengths of 250 mm is 1e-13."""
-GEOMETRY = tuple(
-    f"geometry_{g}" for g in ("scale", "base_radius", "base_height", "platform_radius", "platform_height")
-)
+GEOMETRY = tuple(f"geometry_{g}" for g in ("scale", "base_radius", "base_height", "platform_radius", "platform_height"))
 """How a file's geometry may be wrong as a whole: all of it, or radius and height over the pivot of either plate."""
 GROUPS = (
-    "base_joint", "platform_joint", "leg_offset", "geometry_scale", "geometry_base_radius", "leg_scale", "axes", "pivot"
+    "base_joint",
+    "platform_joint",
+    "leg_offset",
+    "geometry_scale",
+    "geometry_base_radius",
+    "leg_scale",
+    "axes",
+    "pivot",
 )
 SIZED = {
-    "base_joint": 0, "platform_joint": 0, "leg_offset": 0, "geometry_scale": -1, "geometry_base_radius": -1,
-    "leg_scale": 1, "axes": 2, "pivot": 3,
+    "base_joint": 0,
+    "platform_joint": 0,
+    "leg_offset": 0,
+    "geometry_scale": -1,
+    "geometry_base_radius": -1,
+    "leg_scale": 1,
+    "axes": 2,
+    "pivot": 3,
 }
 GEOMETRY_COLUMNS = {"geometry_scale": slice(0, 1), "geometry_base_radius": slice(1, 5)}
 LARGEST_STROKE = 2.0
@@ -88,7 +99,13 @@ class Hexapod:
                 raise InputError(f"{name} holds values that are not finite")
             object.__setattr__(self, name, joints)
         for name in (
-            "joint_sigma", "leg_sigma", "scale_sigma", "geometry_sigma", "leg_scale_sigma", "axes_sigma", "pivot_sigma",
+            "joint_sigma",
+            "leg_sigma",
+            "scale_sigma",
+            "geometry_sigma",
+            "leg_scale_sigma",
+            "axes_sigma",
+            "pivot_sigma",
         ):
             value = float(getattr(self, name))
             if not (np.isfinite(value) and value >= 0):
@@ -215,9 +232,9 @@ class Hexapod:
             rhs[:, :, part["platform_joint"][0]] = view.reshape(len(R), 6, 18)
         for group, columns in GEOMETRY_COLUMNS.items():
             if group in part:
-                rhs[:, :, part[group][0]] -= _legs_by_geometry(
-                    self.base_joints, self.platform_joints, normal, R
-                )[..., columns]
+                rhs[:, :, part[group][0]] -= _legs_by_geometry(self.base_joints, self.platform_joints, normal, R)[
+                    ..., columns
+                ]
         if "leg_offset" in part:
             rhs[:, :, part["leg_offset"][0]] += np.eye(6)
         if "leg_scale" in part:
@@ -254,8 +271,13 @@ class Hexapod:
     @property
     def groups(self) -> Any:
         """(m,) int: joints and legs 0, spindles 1, axes 2, pivot 3; -1 for the geometry: the file stays the file."""
-        return np.array([SIZED[group] for group, (place, _) in self._split(np.zeros(len(self.names))).items()
-                         for _ in range(place.stop - place.start)])
+        return np.array(
+            [
+                SIZED[group]
+                for group, (place, _) in self._split(np.zeros(len(self.names))).items()
+                for _ in range(place.stop - place.start)
+            ]
+        )
 
     def resized(self, sizes: Array) -> Hexapod:
         """The same hexapod with the standard deviations of its errors multiplied by the factor of their group."""

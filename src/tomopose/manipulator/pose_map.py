@@ -113,7 +113,11 @@ class PoseMap:
 
     def to_json(self) -> dict[str, Any]:
         return {
-            "order": self.order, "t_scale_mm": self.t_scale, "w_scale_rad": self.w_scale,
-            "t_sigma_mm": self.t_sigma, "w_sigma_rad": self.w_sigma, "factors": list(self.factors or ()),
+            "order": self.order,
+            "t_scale_mm": self.t_scale,
+            "w_scale_rad": self.w_scale,
+            "t_sigma_mm": self.t_sigma,
+            "w_sigma_rad": self.w_sigma,
+            "factors": list(self.factors or ()),
             "repeatability": self.repeatability.to_json(),
         }

@@ -98,7 +98,9 @@ class PoseSequence:
         """From positions (n, 3), mm, and a convention's orientation columns (n, 3 or 4), in its unit."""
         positions = np.asarray(positions, dtype=np.float64)
         T_MH = RigidTransform(
-            R=rotation_from_convention(np.asarray(orientations), convention), t=positions, source=Frame.M,
+            R=rotation_from_convention(np.asarray(orientations), convention),
+            t=positions,
+            source=Frame.M,
             target=Frame.H,
         )
         ids = range(len(positions)) if pose_id is None else pose_id

@@ -33,7 +33,13 @@ from tomopose.units import Array, float_array
 
 JointKind = Literal["turning", "sliding"]
 ERRORS: Mapping[str, str] = {
-    "a": "mm", "alpha": "rad", "d": "mm", "theta_offset": "rad", "beta": "rad", "e_cos": "rad", "e_sin": "rad",
+    "a": "mm",
+    "alpha": "rad",
+    "d": "mm",
+    "theta_offset": "rad",
+    "beta": "rad",
+    "e_cos": "rad",
+    "e_sin": "rad",
 }
 """Errors that a joint may have, and their units: length, twist, offset, joint zero, Hayati's turn, gear."""
 
@@ -107,7 +113,9 @@ class SerialRobot:
         """(joint, error name, sigma) of each modelled error, in the order of p."""
         return tuple(
             (k, name, float(joint.sigma[name]))
-            for k, joint in enumerate(self.joints) for name in ERRORS if joint.sigma.get(name, 0.0) > 0
+            for k, joint in enumerate(self.joints)
+            for name in ERRORS
+            if joint.sigma.get(name, 0.0) > 0
         )
 
     @property
@@ -171,7 +179,10 @@ class SerialRobot:
         return T, self._joint_jacobian(screws, T, q, error), self._error_jacobian(screws, T, q)
 
     def _joint_jacobian(
-        self, screws: Mapping[tuple[int, str], tuple[Array, Array, bool]], T: Array, q: Array,
+        self,
+        screws: Mapping[tuple[int, str], tuple[Array, Array, bool]],
+        T: Array,
+        q: Array,
         error: list[dict[str, float]],
     ) -> Array:
         columns = []
@@ -185,9 +196,7 @@ class SerialRobot:
             columns.append(column * gear[:, None])
         return np.stack(columns, axis=2)
 
-    def _error_jacobian(
-        self, screws: Mapping[tuple[int, str], tuple[Array, Array, bool]], T: Array, q: Array
-    ) -> Array:
+    def _error_jacobian(self, screws: Mapping[tuple[int, str], tuple[Array, Array, bool]], T: Array, q: Array) -> Array:
         columns = []
         for k, name, _ in self._errors:
             if name in ("e_cos", "e_sin"):
@@ -327,11 +336,15 @@ class SerialRobot:
             "convention": self.convention,
             "joints": [
                 {
-                    "a_mm": j.a, "alpha_deg": float(np.degrees(j.alpha)), "d_mm": j.d,
-                    "theta_offset_deg": float(np.degrees(j.theta_offset)), "kind": j.kind,
+                    "a_mm": j.a,
+                    "alpha_deg": float(np.degrees(j.alpha)),
+                    "d_mm": j.d,
+                    "theta_offset_deg": float(np.degrees(j.theta_offset)),
+                    "kind": j.kind,
                     "sigma": {
-                        f"{name}_{'mm' if ERRORS[name] == 'mm' else 'deg'}":
-                            value if ERRORS[name] == "mm" else float(np.degrees(value))
+                        f"{name}_{'mm' if ERRORS[name] == 'mm' else 'deg'}": value
+                        if ERRORS[name] == "mm"
+                        else float(np.degrees(value))
                         for name, value in j.sigma.items()
                     },
                 }

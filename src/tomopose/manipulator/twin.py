@@ -145,8 +145,11 @@ class TwinRobots:
         """All but the source's pose table, which belongs to a run."""
         return {
             **{who: {"kind": machine.kind, **machine.to_json()} for who, machine in self._machines()},
-            "base": self.base.matrix.tolist(), "focus_mm": self.focus.tolist(), "base_t_sigma_mm": self.base_t_sigma,
-            "base_w_sigma_rad": self.base_w_sigma, "focus_sigma_mm": self.focus_sigma,
+            "base": self.base.matrix.tolist(),
+            "focus_mm": self.focus.tolist(),
+            "base_t_sigma_mm": self.base_t_sigma,
+            "base_w_sigma_rad": self.base_w_sigma,
+            "focus_sigma_mm": self.focus_sigma,
         }
 
 
@@ -157,15 +160,20 @@ def twin_from_document(
     try:
         machines = {
             who: machine_from(document[who]["kind"], {k: v for k, v in document[who].items() if k != "kind"}, where)
-            if who in document else None
+            if who in document
+            else None
             for who in ("detector", "source")
         }
         base = RigidTransform.from_matrix(
             np.asarray(document["base"]), source=source_poses.T_MH.target, target=source_poses.T_MH.target
         )
         return TwinRobots(
-            **machines, source_poses=source_poses, base=base, focus=document["focus_mm"],
-            base_t_sigma=float(document["base_t_sigma_mm"]), base_w_sigma=float(document["base_w_sigma_rad"]),
+            **machines,
+            source_poses=source_poses,
+            base=base,
+            focus=document["focus_mm"],
+            base_t_sigma=float(document["base_t_sigma_mm"]),
+            base_w_sigma=float(document["base_w_sigma_rad"]),
             focus_sigma=float(document["focus_sigma_mm"]),
         )
     except KeyError as error:

@@ -40,7 +40,16 @@ from tomopose.manipulator.twin import TwinRobots
 from tomopose.units import Array, float_array
 
 KEYS = (
-    "schema", "detector", "source", "base", "focus_mm", "focus_sigma_mm", "panel", "units", "name", "comment",
+    "schema",
+    "detector",
+    "source",
+    "base",
+    "focus_mm",
+    "focus_sigma_mm",
+    "panel",
+    "units",
+    "name",
+    "comment",
     "provenance",
 )
 OTHER_UNITS = {"focus_m", "focus", "focus_sigma_m"}
@@ -73,8 +82,14 @@ class TwinDrawing:
     def robots(self, source_poses: PoseSequence) -> TwinRobots:
         """The twins with the poses of the source's flange in its own base."""
         return TwinRobots(
-            detector=self.detector, source=self.source, source_poses=source_poses, base=self.base, focus=self.focus,
-            base_t_sigma=self.base_t_sigma, base_w_sigma=self.base_w_sigma, focus_sigma=self.focus_sigma,
+            detector=self.detector,
+            source=self.source,
+            source_poses=source_poses,
+            base=self.base,
+            focus=self.focus,
+            base_t_sigma=self.base_t_sigma,
+            base_w_sigma=self.base_w_sigma,
+            focus_sigma=self.focus_sigma,
         )
 
     def mount(self, scanner: Scanner) -> RigidTransform:
@@ -122,12 +137,11 @@ def twin_drawing(document: Mapping[str, Any], where: str, *, folder: Path | None
     machines = {who: _machine(document[who], f"{where}: {who}", folder) for who in ("detector", "source")}
     return TwinDrawing(
         **machines,
-        base=RigidTransform(
-            R=rotation_from_angles(np.radians(angles)), t=t, source=Frame.H, target=Frame.H
-        ),
+        base=RigidTransform(R=rotation_from_angles(np.radians(angles)), t=t, source=Frame.H, target=Frame.H),
         focus=vector(document["focus_mm"], (3,), "focus_mm", where),
         origin=vector(panel["origin_mm"], (3,), "origin_mm", f"{where}: panel"),
-        u_axis=float_array(u), v_axis=float_array(v / np.linalg.norm(v)),
+        u_axis=float_array(u),
+        v_axis=float_array(v / np.linalg.norm(v)),
         base_t_sigma=_sigma(base, "sigma_t_mm", 20.0, f"{where}: base"),
         base_w_sigma=float(np.radians(_sigma(base, "sigma_deg", float(np.degrees(0.02)), f"{where}: base"))),
         focus_sigma=_sigma(document, "focus_sigma_mm", 5.0, where),

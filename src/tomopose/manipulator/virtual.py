@@ -23,8 +23,14 @@ from tomopose.units import Array
 
 
 def typical_hexapod(
-    *, base_radius: float = 160.0, platform_radius: float = 90.0, leg: float = 250.0, pivot_height: float = 200.0,
-    half_gap_deg: float = 5.0, joint_sigma: float = 0.1, leg_sigma: float = 0.1,
+    *,
+    base_radius: float = 160.0,
+    platform_radius: float = 90.0,
+    leg: float = 250.0,
+    pivot_height: float = 200.0,
+    half_gap_deg: float = 5.0,
+    joint_sigma: float = 0.1,
+    leg_sigma: float = 0.1,
 ) -> Hexapod:
     """A hexapod of the size of the paper's: joints in three pairs, lengths in mm, the pivot above the platform.
 
@@ -51,7 +57,10 @@ def typical_hexapod(
 
 
 def typical_robot(
-    *, length_sigma: float = 0.2, angle_sigma: float = np.radians(0.02), eccentricity_sigma: float = 0.0,
+    *,
+    length_sigma: float = 0.2,
+    angle_sigma: float = np.radians(0.02),
+    eccentricity_sigma: float = 0.0,
 ) -> SerialRobot:
     """A 6R robot of about 0.9 m reach with a spherical wrist (DH), the plate 100 mm in front of it.
 
@@ -99,7 +108,11 @@ def lag_of_backlash(x: Array, play: float) -> Array:
 
 
 def real_motion(
-    machine: ErrorModel, poses: PoseSequence, p: Array, *, disturbance: Disturbance | None = None,
+    machine: ErrorModel,
+    poses: PoseSequence,
+    p: Array,
+    *,
+    disturbance: Disturbance | None = None,
     rng: np.random.Generator | None = None,
 ) -> PoseSequence:
     """Where the real plate stands in each pose of the table: the truth of a virtual experiment.
@@ -133,7 +146,5 @@ def encoder_readout(poses: PoseSequence, *, settling: Repeatability, rng: np.ran
     """
     delta = rng.standard_normal((len(poses), 6)) * np.sqrt(settling.variance)
     w, shift = delta[:, :3], delta[:, 3:]
-    encoder = RigidTransform(
-        R=exp_rotation(w) @ poses.T_MH.R, t=poses.T_MH.t + shift, source=Frame.M, target=Frame.H
-    )
+    encoder = RigidTransform(R=exp_rotation(w) @ poses.T_MH.R, t=poses.T_MH.t + shift, source=Frame.M, target=Frame.H)
     return replace(poses, T_MH=encoder, T_MH_set=poses.T_MH, source="encoder")

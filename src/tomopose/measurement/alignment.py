@@ -117,8 +117,12 @@ def _turn(datums: tuple[Datum, Datum, Datum]) -> Array:
     if first.direction is None:
         raise InputError("the first datum has no direction; begin with a plane or an axis")
     e_1 = first.direction
-    ways = [second.direction, second.point - first.point if len(first.places) > 1 else None, third.direction,
-            third.point - second.point]
+    ways = [
+        second.direction,
+        second.point - first.point if len(first.places) > 1 else None,
+        third.direction,
+        third.point - second.point,
+    ]
     for way in ways:
         if way is None:
             continue

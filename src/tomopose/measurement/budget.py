@@ -78,7 +78,10 @@ def half_width(u: float, dof: float) -> float:
 
 
 def budget(
-    result: MeasurementResult, *, repeat: Repeat | None = None, calibration: float | None = None,
+    result: MeasurementResult,
+    *,
+    repeat: Repeat | None = None,
+    calibration: float | None = None,
     simulated: Simulated | None = None,
 ) -> Budget:
     """Everything about one result together; see the module.
@@ -103,9 +106,18 @@ def budget(
     u, dof = _together(shares)
     known = math.isfinite(result.u) or s is not None or simulated is not None
     return Budget(
-        volume=result.volume, name=result.name, unit=result.unit, value=result.value, fit=result.u, repeats=s,
-        calibration=calibration, simulation=None if simulated is None else simulated.u, mean_error=mean_error,
-        corrected=result.value - (mean_error or 0.0), u=u if known else math.nan, dof=dof,
+        volume=result.volume,
+        name=result.name,
+        unit=result.unit,
+        value=result.value,
+        fit=result.u,
+        repeats=s,
+        calibration=calibration,
+        simulation=None if simulated is None else simulated.u,
+        mean_error=mean_error,
+        corrected=result.value - (mean_error or 0.0),
+        u=u if known else math.nan,
+        dof=dof,
         interval=_in_words(words, simulated, mean_error) if known else "not determined",
     )
 

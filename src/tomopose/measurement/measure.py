@@ -68,8 +68,14 @@ def measure(
         if progress is not None:
             progress(done + 1, len(named))
     return MeasurementResults(
-        plan_name=plan.name, results=tuple(results), features=features, notes=notes, scale=scale, alignments=alignments,
-        groups=plan.repeats, spacing_mm={n: float(v.grid.spacing.max()) for n, v in named.items()},
+        plan_name=plan.name,
+        results=tuple(results),
+        features=features,
+        notes=notes,
+        scale=scale,
+        alignments=alignments,
+        groups=plan.repeats,
+        spacing_mm={n: float(v.grid.spacing.max()) for n, v in named.items()},
         provenance=provenance,
     )
 
@@ -112,21 +118,29 @@ class _Bench:
         if (s.background is None) != (s.material is None):
             raise InputError("surface: background and material levels are given together or not at all")
         self.levels: GreyLevels = (
-            given_levels(s.background, s.material) if s.background is not None and s.material is not None
+            given_levels(s.background, s.material)
+            if s.background is not None and s.material is not None
             else grey_levels(volume)[-1]
         )
         unit = float(volume.grid.spacing.min())
         search = EdgeSettings().search_distance if s.search_distance_mm is None else s.search_distance_mm / unit
         self.settings = EdgeSettings(
-            search_distance=search, window=s.window_voxel, contrast_threshold=s.contrast_threshold, method=s.method,
-            sigma=s.sigma_mm, plateau_radius=s.plateau_radius_voxel,
+            search_distance=search,
+            window=s.window_voxel,
+            contrast_threshold=s.contrast_threshold,
+            method=s.method,
+            sigma=s.sigma_mm,
+            plateau_radius=s.plateau_radius_voxel,
         )
         self._surface: Surface | None = None
 
     def surface(self) -> Surface:
         if self._surface is None:
             self._surface = surface(
-                self.volume, levels=self.levels, method=self.plan.surface.method, edges=self.settings,
+                self.volume,
+                levels=self.levels,
+                method=self.plan.surface.method,
+                edges=self.settings,
                 curvature_correction=self.plan.surface.curvature_correction,
             )
             self.notes += [f"surface: {n}" for n in self._surface.notes]
@@ -172,8 +186,9 @@ class _Bench:
         x, n = (np.concatenate([p[k] for p in patterns]) for k in (0, 1))
         found = probe(self.volume, x, n, settings=self.settings, contrast=self.levels.contrast)
         good = found.good
-        return best_fit(alignment, (x[good] - alignment.t) @ alignment.R, n[good] @ alignment.R,
-                        found.edges.offset[good])
+        return best_fit(
+            alignment, (x[good] - alignment.t) @ alignment.R, n[good] @ alignment.R, found.edges.offset[good]
+        )
 
     def _feature(self, name: str, plan: FeaturePlan, alignment: Alignment) -> Feature:
         try:
@@ -211,8 +226,11 @@ class _Bench:
         return found.points[found.good], found.normals[found.good], found.edges.sigma, None
 
     def _fitted(self, plan: FeaturePlan, alignment: Alignment, points: Array, area: Array | None) -> Feature:
-        options: dict[str, Any] = {"area": area, "outliers": plan.outliers,
-                                   "correlation_range": CORRELATION_VOXELS * float(self.volume.grid.spacing.max())}
+        options: dict[str, Any] = {
+            "area": area,
+            "outliers": plan.outliers,
+            "correlation_range": CORRELATION_VOXELS * float(self.volume.grid.spacing.max()),
+        }
         simple = {"plane": fit_plane, "line": fit_line, "circle": fit_circle}
         if plan.kind in simple:
             return simple[plan.kind](points, **options)
@@ -229,8 +247,13 @@ class _Bench:
             raise InputError("the plan has no spheres")
         calibrated = np.array(plan.centres)
         fits, which = measure_spheres(
-            self.surface(), calibrated, plan.diameter_mm, tolerance=plan.tolerance_mm, safety=plan.safety_mm,
-            max_angle=float(np.radians(plan.max_angle_deg)), outliers=plan.outliers,
+            self.surface(),
+            calibrated,
+            plan.diameter_mm,
+            tolerance=plan.tolerance_mm,
+            safety=plan.safety_mm,
+            max_angle=float(np.radians(plan.max_angle_deg)),
+            outliers=plan.outliers,
         )
         numbers = sorted(fits)
         factor = scale_factor(np.array([fits[k].point for k in numbers]), calibrated[numbers])
@@ -252,20 +275,35 @@ def _sphere_rows(
     calibrated = np.array(spheres.centres)
     fits = {k: features[sphere_name(k)] for k in range(len(calibrated)) if sphere_name(k) in features}
 
-    def row(name: str, kind: str, found: m.Measured, reference: float | None, u_reference: float = 0.0,
-            limit: LimitPlan | None = None) -> MeasurementResult:
+    def row(
+        name: str,
+        kind: str,
+        found: m.Measured,
+        reference: float | None,
+        u_reference: float = 0.0,
+        limit: LimitPlan | None = None,
+    ) -> MeasurementResult:
         scaled = replace(found, value=found.value * scale, u=found.u * scale)
         return _result(plan, name, kind, scaled, reference, u_reference, _mpe(limit, reference), "MPE")
 
     rows = []
     for i, j in combinations(fits, 2):
         true = float(np.linalg.norm(calibrated[i] - calibrated[j]))
-        rows.append(row(f"SD {i + 1:02d}-{j + 1:02d}", "distance", m.distance(fits[i], fits[j]), true,
-                        spheres.u_distance_mm, spheres.mpe_distance))
+        rows.append(
+            row(
+                f"SD {i + 1:02d}-{j + 1:02d}",
+                "distance",
+                m.distance(fits[i], fits[j]),
+                true,
+                spheres.u_distance_mm,
+                spheres.mpe_distance,
+            )
+        )
     diameters = spheres.calibrated_diameters_mm or (spheres.diameter_mm,) * len(calibrated)
     for k, f in fits.items():
-        rows.append(row(f"D {k + 1:02d}", "diameter", m.diameter(f), diameters[k], spheres.u_diameter_mm,
-                        spheres.mpe_diameter))
+        rows.append(
+            row(f"D {k + 1:02d}", "diameter", m.diameter(f), diameters[k], spheres.u_diameter_mm, spheres.mpe_diameter)
+        )
     for which_form in ("form", "form_95", "form_25"):
         rows += [row(f"{which_form} {k + 1:02d}", which_form, m.form(f, which_form), None) for k, f in fits.items()]
     return rows
@@ -279,8 +317,12 @@ def _outward(plan: FeaturePlan) -> Array:
 def _turned(plane: Feature) -> Feature:
     """The same plane with its normal the other way round, and its residuals with it."""
     flip = np.array([1, 1, 1, -1, -1, -1, 1, 1.0])
-    return replace(plane, vector=plane.vector * flip, covariance=plane.covariance * np.outer(flip, flip),
-                   residuals=-plane.residuals)
+    return replace(
+        plane,
+        vector=plane.vector * flip,
+        covariance=plane.covariance * np.outer(flip, flip),
+        residuals=-plane.residuals,
+    )
 
 
 def _curvature_corrected(feature: Feature, sigma: float) -> Feature:
@@ -318,9 +360,16 @@ def _row(
     if p.kind in m.UNITS:
         reference = p.calibrated_deg if p.calibrated_deg is not None else p.nominal_deg
         degree = math.radians(1.0)
-        return _result(plan, p.name, p.kind, found, None if reference is None else reference * degree,
-                       p.u_calibrated_deg * degree, None if p.tolerance_deg is None else p.tolerance_deg * degree,
-                       "tolerance")
+        return _result(
+            plan,
+            p.name,
+            p.kind,
+            found,
+            None if reference is None else reference * degree,
+            p.u_calibrated_deg * degree,
+            None if p.tolerance_deg is None else p.tolerance_deg * degree,
+            "tolerance",
+        )
     length = p.calibrated_mm if p.calibrated_mm is not None else p.nominal_mm
     limit, rule = (_mpe(p.mpe, length), "MPE") if p.mpe is not None else (p.tolerance_mm, "tolerance")
     return _result(plan, p.name, p.kind, found, length, p.u_calibrated_mm, limit, rule)
@@ -333,13 +382,29 @@ def _mpe(limit: LimitPlan | None, length: float | None) -> float | None:
 
 
 def _result(
-    plan: MeasurementPlan, name: str, kind: str, found: m.Measured, reference: float | None, u_reference: float,
-    limit: float | None, rule: str,
+    plan: MeasurementPlan,
+    name: str,
+    kind: str,
+    found: m.Measured,
+    reference: float | None,
+    u_reference: float,
+    limit: float | None,
+    rule: str,
 ) -> MeasurementResult:
     if found.unit == "mm" and plan.temperature_C != m.REFERENCE_TEMPERATURE_C and plan.expansion_per_K:
         found = m.at_reference_temperature(found, plan.temperature_C, plan.expansion_per_K)
     return MeasurementResult(
-        name=name, kind=kind, value=found.value, u=found.u, dof=found.dof, unit=found.unit, method=found.method,
-        direction=found.direction, reference=reference, u_reference=u_reference, limit=limit,
-        limit_rule=rule if limit is not None else "", contributions={"fit": found.u},
+        name=name,
+        kind=kind,
+        value=found.value,
+        u=found.u,
+        dof=found.dof,
+        unit=found.unit,
+        method=found.method,
+        direction=found.direction,
+        reference=reference,
+        u_reference=u_reference,
+        limit=limit,
+        limit_rule=rule if limit is not None else "",
+        contributions={"fit": found.u},
     )

@@ -16,8 +16,14 @@ import numpy as np
 from tomopose.errors import FileError
 from tomopose.units import Array
 
-FOLDERS = {"Plane": "plane", "Line3d": "line", "Circle3d": "circle", "Sphere": "sphere", "Cylinder": "cylinder",
-           "Cone": "cone"}
+FOLDERS = {
+    "Plane": "plane",
+    "Line3d": "line",
+    "Circle3d": "circle",
+    "Sphere": "sphere",
+    "Cylinder": "cylinder",
+    "Cone": "cone",
+}
 NUMBERS = {"plane": 6, "line": 6, "circle": 7, "sphere": 4, "cylinder": 7, "cone": 8}
 
 
@@ -67,12 +73,14 @@ def read_reference_pair(path: str | Path) -> ReferencePair:
     if points.shape != (announced, 3) or fit.shape != (NUMBERS[kind],):
         raise FileError(
             f"{path}: {announced} points announced, {points.shape} found; fit of {len(fit)} numbers where a {kind} has "
-            f"{NUMBERS[kind]}", path=path,
+            f"{NUMBERS[kind]}",
+            path=path,
         )
     if kind == "sphere":
         return ReferencePair(kind=kind, points=points, point=fit[:3], direction=np.full(3, np.nan), diameter=fit[3])
     if kind == "cone":
-        return ReferencePair(kind=kind, points=points, point=fit[:3], direction=fit[3:6], distance=fit[6],
-                             apex_angle=np.radians(fit[7]))
+        return ReferencePair(
+            kind=kind, points=points, point=fit[:3], direction=fit[3:6], distance=fit[6], apex_angle=np.radians(fit[7])
+        )
     diameter = fit[6] if len(fit) > 6 else np.nan
     return ReferencePair(kind=kind, points=points, point=fit[:3], direction=fit[3:6], diameter=diameter)

@@ -20,11 +20,13 @@ Vector = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
 Length = Annotated[float, Field(ge=0)]
 NEEDS = {
-    "plane": ("point", "direction", "u", "v"), "sphere": ("point", "radius_mm"),
+    "plane": ("point", "direction", "u", "v"),
+    "sphere": ("point", "radius_mm"),
     "calotte": ("point", "radius_mm", "direction", "cap_deg"),
     "cylinder": ("point", "direction", "radius_mm", "length_mm"),
     "cone": ("point", "direction", "radius_mm", "length_mm", "half_angle_deg"),
-    "circle": ("point", "direction", "radius_mm"), "line": ("point", "direction", "normal", "length_mm"),
+    "circle": ("point", "direction", "radius_mm"),
+    "line": ("point", "direction", "normal", "length_mm"),
 }
 PROBED_ONLY = ("circle", "line")
 PAIRS = ("distance", "angle")

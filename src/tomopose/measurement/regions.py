@@ -54,14 +54,21 @@ def nominal_pattern(plan: FeaturePlan, alignment: Alignment) -> tuple[Array, Arr
     elif plan.kind == "line":
         length = _given(plan.length_mm) - 2 * s
         _require_left(plan.kind, length)
-        x, n = line_pattern(point, alignment.directions(plan.direction), alignment.directions(plan.normal), length,
-                            plan.n_points)
+        x, n = line_pattern(
+            point, alignment.directions(plan.direction), alignment.directions(plan.normal), length, plan.n_points
+        )
     else:
         length = _given(plan.length_mm) - 2 * s
         _require_left(plan.kind, length)
         half_angle = np.radians(_given(plan.half_angle_deg)) if plan.kind == "cone" else 0.0
-        x, n = cylinder_pattern(point, alignment.directions(plan.direction), _given(plan.radius_mm), length,
-                                plan.n_points, half_angle=float(half_angle))
+        x, n = cylinder_pattern(
+            point,
+            alignment.directions(plan.direction),
+            _given(plan.radius_mm),
+            length,
+            plan.n_points,
+            half_angle=float(half_angle),
+        )
     return x, -n if plan.inward else n
 
 
@@ -78,7 +85,8 @@ def surface_region(plan: FeaturePlan, alignment: Alignment, points: Array, norma
         if plan.kind == "calotte":
             axis = frame_along(np.asarray(plan.direction))[2]
             inside = np.arccos(np.clip(outward @ axis, -1, 1)) <= np.radians(_given(plan.cap_deg)) - s / max(
-                _given(plan.radius_mm), 1e-9)
+                _given(plan.radius_mm), 1e-9
+            )
     elif plan.kind == "plane":
         frame = frame_along(np.asarray(plan.direction))
         u, v = (np.asarray(w, dtype=np.float64) for w in (plan.u, plan.v))

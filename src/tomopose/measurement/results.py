@@ -20,10 +20,39 @@ from tomopose.measurement.uncertainty import Simulated
 from tomopose.provenance import Provenance
 
 SCHEMA = "measurement"
-COLUMNS = ("volume", "name", "kind", "value", "u", "U95", "unit", "reference", "u_reference", "error", "limit",
-           "within", "direction", "method", "interval")
-BUDGET_COLUMNS = ("volume", "name", "unit", "value", "fit", "repeats", "calibration", "simulation", "mean_error",
-                  "corrected", "u", "dof", "U95", "interval")
+COLUMNS = (
+    "volume",
+    "name",
+    "kind",
+    "value",
+    "u",
+    "U95",
+    "unit",
+    "reference",
+    "u_reference",
+    "error",
+    "limit",
+    "within",
+    "direction",
+    "method",
+    "interval",
+)
+BUDGET_COLUMNS = (
+    "volume",
+    "name",
+    "unit",
+    "value",
+    "fit",
+    "repeats",
+    "calibration",
+    "simulation",
+    "mean_error",
+    "corrected",
+    "u",
+    "dof",
+    "U95",
+    "interval",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,10 +104,23 @@ class MeasurementResult:
 
     def to_json(self) -> dict[str, Any]:
         return {
-            "volume": self.volume, "name": self.name, "kind": self.kind, "value": self.value, "u": self.u,
-            "U95": self.U, "dof": self.dof, "unit": self.unit, "reference": self.reference,
-            "u_reference": self.u_reference, "error": self.error, "limit": self.limit, "limit_rule": self.limit_rule,
-            "within": self.within, "direction": self.direction, "method": self.method, "interval": self.interval,
+            "volume": self.volume,
+            "name": self.name,
+            "kind": self.kind,
+            "value": self.value,
+            "u": self.u,
+            "U95": self.U,
+            "dof": self.dof,
+            "unit": self.unit,
+            "reference": self.reference,
+            "u_reference": self.u_reference,
+            "error": self.error,
+            "limit": self.limit,
+            "limit_rule": self.limit_rule,
+            "within": self.within,
+            "direction": self.direction,
+            "method": self.method,
+            "interval": self.interval,
             "contributions": dict(self.contributions),
         }
 
@@ -139,7 +181,8 @@ class MeasurementResults:
         """Each measurand over each group of at least two volumes."""
         return tuple(
             _repeat(group, name, rows)
-            for group, volumes in self.groups.items() if len(volumes) > 1
+            for group, volumes in self.groups.items()
+            if len(volumes) > 1
             for name, rows in _by_name(r for r in self.results if r.volume in volumes).items()
         )
 
@@ -148,8 +191,12 @@ class MeasurementResults:
         group = {v: g for g, volumes in self.groups.items() for v in volumes}
         repeats = {(r.group, r.name): r for r in self.repeats()}
         return tuple(
-            budget(r, repeat=repeats.get((group.get(r.volume, ""), r.name)),
-                   calibration=self.calibration_u.get(r.volume, {}).get(r.name), simulated=self.simulated.get(r.name))
+            budget(
+                r,
+                repeat=repeats.get((group.get(r.volume, ""), r.name)),
+                calibration=self.calibration_u.get(r.volume, {}).get(r.name),
+                simulated=self.simulated.get(r.name),
+            )
             for r in self.results
         )
 
@@ -159,8 +206,11 @@ class MeasurementResults:
 
     def to_json(self) -> dict[str, Any]:
         return {
-            "plan": self.plan_name, "volumes": list(self.volumes), "spacing_mm": dict(self.spacing_mm),
-            "scale": dict(self.scale), "groups": {g: list(v) for g, v in self.groups.items()},
+            "plan": self.plan_name,
+            "volumes": list(self.volumes),
+            "spacing_mm": dict(self.spacing_mm),
+            "scale": dict(self.scale),
+            "groups": {g: list(v) for g, v in self.groups.items()},
             "alignments": {v: a.to_json() for v, a in self.alignments.items()},
             "results": [r.to_json() for r in self.results],
             "repeats": [vars(r) for r in self.repeats()],
@@ -184,8 +234,9 @@ def _table(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
     for row in rows:
-        writer.writerow(["" if row[c] is None else repr(row[c]) if isinstance(row[c], float) else row[c]
-                         for c in columns])
+        writer.writerow(
+            ["" if row[c] is None else repr(row[c]) if isinstance(row[c], float) else row[c] for c in columns]
+        )
     return text.getvalue()
 
 
@@ -214,7 +265,16 @@ def _repeat(group: str, name: str, rows: list[MeasurementResult]) -> Repeat:
     reference = rows[0].reference
     error = None if reference is None else float(values.mean()) - reference
     # The spread of repeats holds the fit's noise already; the larger of the two stands for both.
-    U = 2.0 * math.sqrt(rows[0].u_reference**2 + max(s, u_fit) ** 2) + (0.0 if error is None else abs(error))
+    U = 2.0 * math.sqrt(rows[0].u_reference ** 2 + max(s, u_fit) ** 2) + (0.0 if error is None else abs(error))
     systematic = "without the systematic part" if error is None else "mean error from the reference"
-    return Repeat(group=group, name=name, n=len(rows), mean=float(values.mean()), s=s, unit=rows[0].unit, error=error,
-                  U=U, interval=f"repeats; {systematic}")
+    return Repeat(
+        group=group,
+        name=name,
+        n=len(rows),
+        mean=float(values.mean()),
+        s=s,
+        unit=rows[0].unit,
+        error=error,
+        U=U,
+        interval=f"repeats; {systematic}",
+    )

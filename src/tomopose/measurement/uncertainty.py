@@ -84,8 +84,8 @@ def distance_uncertainty(covariance: Array, points: Array, i: int, j: int) -> fl
     """Standard uncertainty, mm, of the distance of points i and j, from their joint covariance (3 m, 3 m)."""
     d = points[j] - points[i]
     g = np.zeros(3 * len(points))
-    g[3 * j: 3 * j + 3] = d / np.linalg.norm(d)
-    g[3 * i: 3 * i + 3] = -d / np.linalg.norm(d)
+    g[3 * j : 3 * j + 3] = d / np.linalg.norm(d)
+    g[3 * i : 3 * i + 3] = -d / np.linalg.norm(d)
     return float(np.sqrt(max(float(g @ covariance @ g), 0.0)))
 
 
@@ -93,7 +93,7 @@ def shortest_interval(values: Array, share: float = 0.95) -> tuple[float, float]
     """The shortest interval that holds `share` of the values (JCGM 101:2008, 5.3.4)."""
     ordered = np.sort(np.asarray(values, dtype=np.float64))
     inside = max(int(np.ceil(share * len(ordered))), 1)
-    width = ordered[inside - 1:] - ordered[: len(ordered) - inside + 1]
+    width = ordered[inside - 1 :] - ordered[: len(ordered) - inside + 1]
     k = int(np.argmin(width))
     return float(ordered[k]), float(ordered[k + inside - 1])
 
@@ -131,5 +131,12 @@ def simulate(
         if len(facts) >= 2:
             stable = bool((2 * np.std(facts, axis=0, ddof=1) / np.sqrt(len(facts)) < tolerance).all())
     low, high = shortest_interval(np.array(values))
-    return Simulated(mean=float(np.mean(values)), u=float(np.std(values, ddof=1)), low=low, high=high, runs=len(values),
-                     stable=stable, seed=seed)
+    return Simulated(
+        mean=float(np.mean(values)),
+        u=float(np.std(values, ddof=1)),
+        low=low,
+        high=high,
+        runs=len(values),
+        stable=stable,
+        seed=seed,
+    )

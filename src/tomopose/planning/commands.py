@@ -40,8 +40,10 @@ def pi_gcs(poses: PoseSequence) -> str:
     for k, table in enumerate(_table_lines(poses, ";")):
         x, a = poses.T_MH.t[k], angles[k]
         lines += [
-            *table, f"; pose_id {poses.pose_id[k]}",
-            f"MOV X {x[0]:.6f} Y {x[1]:.6f} Z {x[2]:.6f} U {a[0]:.6f} V {a[1]:.6f} W {a[2]:.6f}", "ONT? X Y Z U V W",
+            *table,
+            f"; pose_id {poses.pose_id[k]}",
+            f"MOV X {x[0]:.6f} Y {x[1]:.6f} Z {x[2]:.6f} U {a[0]:.6f} V {a[1]:.6f} W {a[2]:.6f}",
+            "ONT? X Y Z U V W",
             "POS?",
         ]
     return "\n".join(lines) + "\n"
@@ -54,7 +56,8 @@ def kuka_krl(poses: PoseSequence, *, name: str = "tomopose_run") -> str:
     for k, table in enumerate(_table_lines(poses, ";")):
         x, a = poses.T_MH.t[k], angles[k]
         lines += [
-            *table, f"; pose_id {poses.pose_id[k]}",
+            *table,
+            f"; pose_id {poses.pose_id[k]}",
             f"LIN {{X {x[0]:.6f}, Y {x[1]:.6f}, Z {x[2]:.6f}, A {a[0]:.6f}, B {a[1]:.6f}, C {a[2]:.6f}}}",
             "WAIT SEC 1.0",
         ]
@@ -70,7 +73,8 @@ def abb_rapid(poses: PoseSequence, *, name: str = "tomopose_run") -> str:
         position = ",".join(f"{v:.6f}" for v in x)
         orientation = ",".join(f"{v:.9f}" for v in q[k])
         lines += [
-            *table, f"    ! pose_id {poses.pose_id[k]}",
+            *table,
+            f"    ! pose_id {poses.pose_id[k]}",
             f"    MoveL [[{position}],[{orientation}],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]],v50,fine,tool0;",
             "    WaitTime 1.0;",
         ]
@@ -84,7 +88,10 @@ def ur_script(poses: PoseSequence, *, name: str = "tomopose_run") -> str:
     for k, table in enumerate(_table_lines(poses, "  #")):
         values = ", ".join(f"{v:.9f}" for v in (*(poses.T_MH.t[k] / 1000.0), *vectors[k]))
         lines += [
-            *table, f"  # pose_id {poses.pose_id[k]}", f"  movel(p[{values}], a=0.1, v=0.02)", "  sleep(1.0)",
+            *table,
+            f"  # pose_id {poses.pose_id[k]}",
+            f"  movel(p[{values}], a=0.1, v=0.02)",
+            "  sleep(1.0)",
         ]
     return "\n".join([*lines, "end"]) + "\n"
 

@@ -66,7 +66,12 @@ def nominal_mount() -> RigidTransform:
 
 
 def pose_information(
-    scanner: Scanner, poses: PoseSequence, *, T_HT: RigidTransform, t: Array, sigma: float,
+    scanner: Scanner,
+    poses: PoseSequence,
+    *,
+    T_HT: RigidTransform,
+    t: Array,
+    sigma: float,
     free: FreeParameters | None = None,
 ) -> Array:
     """(n, 2, m): whitened Jacobian of every pose by w_HT, t_HT, t and the freed parameters."""
@@ -84,7 +89,12 @@ def _prior_information(free: FreeParameters) -> Array:
 
 
 def predicted_covariance(
-    scanner: Scanner, poses: PoseSequence, *, T_HT: RigidTransform, t: Any, sigma: float = SIGMA_PX,
+    scanner: Scanner,
+    poses: PoseSequence,
+    *,
+    T_HT: RigidTransform,
+    t: Any,
+    sigma: float = SIGMA_PX,
     free: FreeParameters | None = None,
 ) -> Array:
     """(m, m): covariance of a calibration from these poses, before a single image is taken."""
@@ -230,7 +240,8 @@ def _require_determined(L: Array, prior: Array, target: ScanTarget) -> None:
         worst = target.names[int(np.abs(V[:, 0]).argmax())]
         raise NotObservableError(
             f"no poses within these limits determine {worst}; allow more table angles or travel, or give it a prior",
-            direction=worst, singular_values=np.sqrt(np.maximum(value[::-1], 0.0)).tolist(),
+            direction=worst,
+            singular_values=np.sqrt(np.maximum(value[::-1], 0.0)).tolist(),
         )
 
 

@@ -40,7 +40,7 @@ def _gains(L: Array, C: Array, M: Array, criterion: Criterion, sign: int) -> Arr
             return np.where(det > 1e-12, -np.log(np.where(det > 1e-12, det, 1.0)), np.inf)
     B = LC @ M @ np.swapaxes(LC, 1, 2)
     # tr(S^-1 B), S 2 x 2
-    trace = (S[:, 1, 1] * B[:, 0, 0] + S[:, 0, 0] * B[:, 1, 1] - S[:, 0, 1] * B[:, 1, 0] - S[:, 1, 0] * B[:, 0, 1])
+    trace = S[:, 1, 1] * B[:, 0, 0] + S[:, 0, 0] * B[:, 1, 1] - S[:, 0, 1] * B[:, 1, 0] - S[:, 1, 0] * B[:, 0, 1]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(det > 1e-12, -sign * trace / np.where(det > 1e-12, det, 1.0), np.inf)
 
@@ -50,8 +50,15 @@ def _value(C: Array, M: Array, criterion: Criterion) -> float:
 
 
 def exchange(
-    L: Array, n: int, *, M: Array, N_0: Array | None = None, criterion: Criterion = "A", fixed: Any = (),
-    seed: int = 0, starts: int = 3,
+    L: Array,
+    n: int,
+    *,
+    M: Array,
+    N_0: Array | None = None,
+    criterion: Criterion = "A",
+    fixed: Any = (),
+    seed: int = 0,
+    starts: int = 3,
 ) -> Chosen:
     """n of the candidates L (k, 2, m), repetition allowed, that make the criterion small.
 
@@ -88,8 +95,9 @@ def exchange(
     return best
 
 
-def _improve(L: Array, index: list[int], base: Array, N: Array, M: Array, criterion: Criterion,
-             n_fixed: int) -> tuple[list[int], Array]:
+def _improve(
+    L: Array, index: list[int], base: Array, N: Array, M: Array, criterion: Criterion, n_fixed: int
+) -> tuple[list[int], Array]:
     """Exchange the least useful row for the most useful candidate until nothing gets better."""
     m = N.shape[0]
     tiny = 1e-12 * np.eye(m)

@@ -19,9 +19,7 @@ def move_times(poses: PoseSequence, limits: PlanLimits) -> Array:
     T, alpha = poses.T_MH, np.zeros(len(poses)) if poses.alpha is None else poses.alpha
     way = np.linalg.norm(T.t[:, None] - T.t[None], axis=2) / limits.speed
     n = len(poses)
-    turn = rotation_angle_between(
-        np.repeat(T.R, n, axis=0), np.tile(T.R, (n, 1, 1))
-    ).reshape(n, n) / limits.turn_speed
+    turn = rotation_angle_between(np.repeat(T.R, n, axis=0), np.tile(T.R, (n, 1, 1))).reshape(n, n) / limits.turn_speed
     table = np.abs(alpha[:, None] - alpha[None]) / limits.table_speed
     return limits.settle + np.maximum(np.maximum(way, turn), table)
 
@@ -41,13 +39,13 @@ def short_tour(cost: Array, start: int = 0) -> Array:
         changed = False
         for i in range(n - 1):
             a, b = order[i], order[i + 1]
-            c, d = order[i + 2:-1], order[i + 3:]
+            c, d = order[i + 2 : -1], order[i + 3 :]
             if not len(d):
                 continue
             gain = cost[a, b] + cost[c, d] - cost[a, c] - cost[b, d]
             k = int(gain.argmax())
             if gain[k] > 1e-9:
-                order[i + 1:i + 3 + k] = order[i + 1:i + 3 + k][::-1]
+                order[i + 1 : i + 3 + k] = order[i + 1 : i + 3 + k][::-1]
                 changed = True
         if not changed:
             break
@@ -84,6 +82,10 @@ def rows_of(poses: PoseSequence, rows: Any) -> PoseSequence:
     index = np.asarray(rows, dtype=np.intp)
     alpha = np.zeros(len(poses)) if poses.alpha is None else poses.alpha
     return PoseSequence(
-        T_MH=poses.T_MH[index], pose_id=tuple(f"p{k:03d}" for k in range(len(index))), alpha=alpha[index],
-        pivot=poses.pivot, convention=poses.convention, source="set",
+        T_MH=poses.T_MH[index],
+        pose_id=tuple(f"p{k:03d}" for k in range(len(index))),
+        alpha=alpha[index],
+        pivot=poses.pivot,
+        convention=poses.convention,
+        source="set",
     )

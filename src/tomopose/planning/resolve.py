@@ -43,14 +43,18 @@ class Resolvability:
         """What these poses would not show, and what would; what no poses show."""
         lines = []
         if self.unresolved:
-            cure = "another table angle, a quarter turn away, would tell" if self.still else (
-                "other table angles, more images or longer travel would tell"
+            cure = (
+                "another table angle, a quarter turn away, would tell"
+                if self.still
+                else ("other table angles, more images or longer travel would tell")
             )
             names = ", ".join(f"{h.name} (delta chi2 {h.delta:.2g} of {BETTER:g})" for h in self.unresolved)
             lines.append(f"these poses would not show: {names}; {cure}")
         else:
-            lines.append(f"all of {sum(not h.symmetry for h in self.diagnosis.hypotheses) - 1} rival conventions would "
-                         f"show by 5 sigma or more")
+            lines.append(
+                f"all of {sum(not h.symmetry for h in self.diagnosis.hypotheses) - 1} rival conventions would "
+                f"show by 5 sigma or more"
+            )
         if self.symmetric:
             lines.append(f"true symmetries, which no poses show: {', '.join(h.name for h in self.symmetric)}")
         return tuple(lines)
@@ -58,8 +62,9 @@ class Resolvability:
 
 def exact_problem(scanner: Scanner, poses: PoseSequence, *, T_HT: RigidTransform, t: Array, sigma: float) -> Problem:
     """The centres that these poses would show, without noise; sigma: standard uncertainty of a coordinate, px."""
-    x = project_ball(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=t,
-                     alpha=np.zeros(len(poses)) if poses.alpha is None else poses.alpha)
+    x = project_ball(
+        scanner, T_HT=T_HT, T_MH=poses.T_MH, t=t, alpha=np.zeros(len(poses)) if poses.alpha is None else poses.alpha
+    )
     return pair(scanner, poses, BallObservations.from_sigma(x, sigma, pose_id=poses.pose_id))
 
 
@@ -75,8 +80,11 @@ def resolvability(
     plain = [h for h in rivals if not h.symmetry]
     unresolved = tuple(h for h in close if not h.symmetry)
     return Resolvability(
-        diagnosis=diagnosis, unresolved=unresolved, symmetric=tuple(h for h in close if h.symmetry),
-        score=1.0 - len(unresolved) / max(len(plain), 1), still=float(np.ptp(problem.alpha)) == 0.0,
+        diagnosis=diagnosis,
+        unresolved=unresolved,
+        symmetric=tuple(h for h in close if h.symmetry),
+        score=1.0 - len(unresolved) / max(len(plain), 1),
+        still=float(np.ptp(problem.alpha)) == 0.0,
     )
 
 

@@ -71,9 +71,14 @@ def scan_target(
     x_W = box_points() if points is None else np.asarray(points, dtype=np.float64)
     if x_W.ndim != 2 or x_W.shape[1] != 3 or len(x_W) < 3:
         raise InputError(f"object points have shape {x_W.shape}; at least three points (p, 3) in mm are needed")
-    names = tangent_names(tuple(range(n_balls)), free) if free is not None else (
-        *(f"w_HT_{c}" for c in "xyz"), *(f"t_HT_{c}" for c in "xyz"),
-        *(f"t_{c}" if n_balls == 1 else f"t[{b}]_{c}" for b in range(n_balls) for c in "xyz"),
+    names = (
+        tangent_names(tuple(range(n_balls)), free)
+        if free is not None
+        else (
+            *(f"w_HT_{c}" for c in "xyz"),
+            *(f"t_HT_{c}" for c in "xyz"),
+            *(f"t_{c}" if n_balls == 1 else f"t[{b}]_{c}" for b in range(n_balls) for c in "xyz"),
+        )
     )
     # x_W at home = T_HT x_M, so the object's points sit at x_M in the moved plate; a rigid move of the object moves x_M
     x_M = T_HT.inv.apply(x_W)

@@ -71,7 +71,8 @@ class Checkpoint:
         generation = 1 - self._generation
         field.save(self._folder / f"saved-{generation}")
         write_json(
-            self._folder / "state.json", NAME,
+            self._folder / "state.json",
+            NAME,
             {"fingerprint": self._identity, "generation": generation, "updates_done": done},
         )
         shutil.rmtree(self._folder / f"saved-{self._generation}", ignore_errors=True)

@@ -81,7 +81,9 @@ def check_consistency(scan: LineIntegrals, grid: VoxelGrid) -> Consistency:
             residual[name] = coarse_residual(seen, coarse, coarse_grid)
     best = min(residual, key=lambda name: residual[name])
     return Consistency(
-        residual=residual, best=best, views=len(chosen),
+        residual=residual,
+        best=best,
+        views=len(chosen),
         contradicted=residual["as given"] > CLEARLY * residual[best],
     )
 

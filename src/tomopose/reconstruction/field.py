@@ -65,7 +65,11 @@ class Piece:
     """One slab (or the whole) with its engine, in memory."""
 
     def __init__(
-        self, engine: str, matrices: ProjectionMatrices, grid: VoxelGrid, support: np.ndarray | None,
+        self,
+        engine: str,
+        matrices: ProjectionMatrices,
+        grid: VoxelGrid,
+        support: np.ndarray | None,
         options: dict[str, Any],
     ) -> None:
         self.grid = grid
@@ -125,8 +129,15 @@ class DiskField:
     """
 
     def __init__(
-        self, engine: str, matrices: ProjectionMatrices, grid: VoxelGrid, support: np.ndarray | None,
-        options: dict[str, Any], *, slabs: int, scratch: Path,
+        self,
+        engine: str,
+        matrices: ProjectionMatrices,
+        grid: VoxelGrid,
+        support: np.ndarray | None,
+        options: dict[str, Any],
+        *,
+        slabs: int,
+        scratch: Path,
     ) -> None:
         self.grid, self._scratch = grid, scratch
         self._bounds = slab_bounds(grid.shape[0], slabs)
@@ -201,16 +212,30 @@ class DaskField:
     """Slabs on the workers of a dask cluster, one actor a slab; images travel, the volume stays where it is."""
 
     def __init__(
-        self, engine: str, matrices: ProjectionMatrices, grid: VoxelGrid, support: np.ndarray | None,
-        options: dict[str, Any], *, slabs: int, client: Any,
+        self,
+        engine: str,
+        matrices: ProjectionMatrices,
+        grid: VoxelGrid,
+        support: np.ndarray | None,
+        options: dict[str, Any],
+        *,
+        slabs: int,
+        client: Any,
     ) -> None:
         self.grid = grid
         self._bounds = slab_bounds(grid.shape[0], slabs)
         workers = sorted(client.scheduler_info(n_workers=-1)["workers"])
         futures = [
             client.submit(
-                Piece, engine, matrices, grid.slab(a, b), None if support is None else support[a:b], options,
-                actor=True, workers=[workers[i % len(workers)]], pure=False,
+                Piece,
+                engine,
+                matrices,
+                grid.slab(a, b),
+                None if support is None else support[a:b],
+                options,
+                actor=True,
+                workers=[workers[i % len(workers)]],
+                pure=False,
             )
             for i, (a, b) in enumerate(self._bounds)
         ]

@@ -227,8 +227,13 @@ def linearised(p: np.ndarray, coefficients: Sequence[float], j: int) -> np.ndarr
 
 
 def beam_hardening_polynomial(
-    energies_keV: Any, fluence: Any, attenuation_per_mm: Any, *, thickness_mm: float,
-    reference_keV: float | None = None, degree: int = 3,
+    energies_keV: Any,
+    fluence: Any,
+    attenuation_per_mm: Any,
+    *,
+    thickness_mm: float,
+    reference_keV: float | None = None,
+    degree: int = 3,
 ) -> tuple[float, ...]:
     """Coefficients c_1 ... of the polynomial that takes polychromatic line integrals of one material to monochromatic.
 

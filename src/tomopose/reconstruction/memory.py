@@ -78,8 +78,15 @@ def require_room_for_cgls(matrices: ProjectionMatrices, grid: VoxelGrid, *, memo
 
 
 def memory_plan(
-    matrices: ProjectionMatrices, grid: VoxelGrid, *, subset_size: int, passes: float, memory_gib: float | None,
-    most_voxels: int, may_cut: bool, support: bool = False,
+    matrices: ProjectionMatrices,
+    grid: VoxelGrid,
+    *,
+    subset_size: int,
+    passes: float,
+    memory_gib: float | None,
+    most_voxels: int,
+    may_cut: bool,
+    support: bool = False,
 ) -> MemoryPlan:
     """How the volume goes into memory.
 

@@ -78,8 +78,17 @@ def source_path(matrices: ProjectionMatrices) -> SourcePath:
     run = np.maximum(gap, 0.1 * typical)  # repeated views have none
     slope[order] = (rise + np.roll(rise, 1)) / (run + np.roll(run, 1))
     return SourcePath(
-        axis=axis, centre=centre, angle=angle, weight=weight, arm=arm, distance=distance, elevation=elevation,
-        tangent=tangents(arm, axis, slope), coverage=float(shared.sum()), circular=circular, full_turn=full,
+        axis=axis,
+        centre=centre,
+        angle=angle,
+        weight=weight,
+        arm=arm,
+        distance=distance,
+        elevation=elevation,
+        tangent=tangents(arm, axis, slope),
+        coverage=float(shared.sum()),
+        circular=circular,
+        full_turn=full,
         smooth=bool((np.abs(rise) < STEEPEST * run).all()),
     )
 

@@ -127,7 +127,11 @@ def reconstruct(
         raise InputError("the mask holds no voxel")
     require_usable(matrices, grid)
     correction = Correction(
-        images_are=images_kind(images, images_are), white=white, dark=dark, bad_pixels=bad_pixels, invalid=invalid,
+        images_are=images_kind(images, images_are),
+        white=white,
+        dark=dark,
+        bad_pixels=bad_pixels,
+        invalid=invalid,
         beam_hardening=tuple(beam_hardening),
     )
     scan = LineIntegrals(images, matrices, correction)
@@ -146,10 +150,19 @@ def reconstruct(
         raise InputError(f"consistency is {consistency!r}; 'error' or 'off' is needed")
 
     settings = {
-        "algorithm": algorithm, "engine": name, "iterations": int(sweeps), "relaxation": list(factors),
-        "order": order if isinstance(order, str) else "given", "seed": seed, "subset_size": int(size),
-        "nonnegative": nonnegative, "mask": support is not None, "images_are": correction.images_are,
-        "invalid": invalid, "beam_hardening": list(correction.beam_hardening), "ring_width": ring_width,
+        "algorithm": algorithm,
+        "engine": name,
+        "iterations": int(sweeps),
+        "relaxation": list(factors),
+        "order": order if isinstance(order, str) else "given",
+        "seed": seed,
+        "subset_size": int(size),
+        "nonnegative": nonnegative,
+        "mask": support is not None,
+        "images_are": correction.images_are,
+        "invalid": invalid,
+        "beam_hardening": list(correction.beam_hardening),
+        "ring_width": ring_width,
     }
     options = dict(engine_options or {})
     stride = sampling_stride(matrices)
@@ -162,8 +175,17 @@ def reconstruct(
         values, residual = solve_cgls(name, scan, grid, support, options, int(sweeps), progress)
     else:
         field = open_field(
-            name, matrices, grid, support, options, subset_size=int(size), sweeps=int(sweeps) + 1,
-            memory_gib=memory_gib, scratch=scratch, client=client, slabs=slabs,
+            name,
+            matrices,
+            grid,
+            support,
+            options,
+            subset_size=int(size),
+            sweeps=int(sweeps) + 1,
+            memory_gib=memory_gib,
+            scratch=scratch,
+            client=client,
+            slabs=slabs,
         )
         samples = Samples(len(scan), stride)
         schedule = []
@@ -203,7 +225,11 @@ def reconstruct(
             "their images"
         )
     return Volume(
-        values=values, grid=grid, view_residual=residual, notes=tuple(notes), settings=settings,
+        values=values,
+        grid=grid,
+        view_residual=residual,
+        notes=tuple(notes),
+        settings=settings,
         provenance=provenance(arguments=settings, seed=seed),
     )
 
@@ -272,8 +298,18 @@ def mask_digest(support: np.ndarray | None) -> str:
 
 
 def open_field(
-    name: str, matrices: ProjectionMatrices, grid: VoxelGrid, support: np.ndarray | None, options: dict[str, Any], *,
-    subset_size: int, sweeps: int, memory_gib: float | None, scratch: str | Path | None, client: Any, slabs: int | None,
+    name: str,
+    matrices: ProjectionMatrices,
+    grid: VoxelGrid,
+    support: np.ndarray | None,
+    options: dict[str, Any],
+    *,
+    subset_size: int,
+    sweeps: int,
+    memory_gib: float | None,
+    scratch: str | Path | None,
+    client: Any,
+    slabs: int | None,
 ) -> Field:
     """Where the volume lives while it is made: in memory, in slabs on disk, or on a cluster."""
     if client is not None:
@@ -283,8 +319,14 @@ def open_field(
         return DaskField(name, matrices, grid, support, options, slabs=slabs or workers, client=client)
     limits = make_engine(name, matrices.select([0]), VoxelGrid(shape=(1, 1, 1), spacing=grid.spacing)).limits
     plan = memory_plan(
-        matrices, grid, subset_size=subset_size, passes=sweeps, memory_gib=memory_gib, most_voxels=limits.most_voxels,
-        may_cut=scratch is not None, support=support is not None,
+        matrices,
+        grid,
+        subset_size=subset_size,
+        passes=sweeps,
+        memory_gib=memory_gib,
+        most_voxels=limits.most_voxels,
+        may_cut=scratch is not None,
+        support=support is not None,
     )
     pieces = slabs or plan.slabs
     if pieces == 1:
@@ -295,8 +337,13 @@ def open_field(
 
 
 def solve_cgls(
-    name: str, scan: LineIntegrals, grid: VoxelGrid, support: np.ndarray | None, options: dict[str, Any],
-    iterations: int, progress: Callable[[int, int], None] | None,
+    name: str,
+    scan: LineIntegrals,
+    grid: VoxelGrid,
+    support: np.ndarray | None,
+    options: dict[str, Any],
+    iterations: int,
+    progress: Callable[[int, int], None] | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """CGLS in one piece, and the residual of each view."""
     engine = make_engine(name, scan.matrices, grid, **options)

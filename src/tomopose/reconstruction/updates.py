@@ -96,8 +96,13 @@ class Samples:
 
 
 def run(
-    schedule: Sequence[tuple[Update, Sequence[Subset]]], field: Field, scan: LineIntegrals, *,
-    samples: Samples, checkpoint: Checkpoint | None, progress: Callable[[int, int], None] | None,
+    schedule: Sequence[tuple[Update, Sequence[Subset]]],
+    field: Field,
+    scan: LineIntegrals,
+    *,
+    samples: Samples,
+    checkpoint: Checkpoint | None,
+    progress: Callable[[int, int], None] | None,
 ) -> None:
     """All stages of a schedule, from where a checkpoint says."""
     total = sum(len(subsets) for _, subsets in schedule)
@@ -127,7 +132,11 @@ def view_residuals(field: Field, scan: LineIntegrals, samples: Samples) -> np.nd
 
 
 def cgls(
-    engine: Any, scan: LineIntegrals, *, iterations: int, support: np.ndarray | None = None,
+    engine: Any,
+    scan: LineIntegrals,
+    *,
+    iterations: int,
+    support: np.ndarray | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Any:
     """Least squares |p - A x|^2 by conjugate gradients (Hestenes and Stiefel), from zero; A' is the engine's transpose.

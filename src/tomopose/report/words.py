@@ -60,7 +60,7 @@ def symbol(name: str) -> str:
     text = name
     for plain_name, greek in GREEK:
         if text.startswith(plain_name):
-            text = greek + text[len(plain_name):]
+            text = greek + text[len(plain_name) :]
             break
     if len(text) > LONGEST_SYMBOL:
         return text.replace("_", " ")

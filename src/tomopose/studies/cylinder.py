@@ -56,7 +56,10 @@ NOTES = (
 
 
 def cylinder_integrals(
-    P: Array, scanner: Scanner, *, radius: float = RADIUS,
+    P: Array,
+    scanner: Scanner,
+    *,
+    radius: float = RADIUS,
     ends: Sequence[tuple[float, float]] = ((-HALF_HEIGHT, HALF_HEIGHT),),
 ) -> Array:
     """Line integrals (n_v, n_u) of upright cylinders about z in the view with matrix P (3, 4), pixel centres.
@@ -128,8 +131,9 @@ def cases_of(scale: Scale, seed: int) -> tuple[dict[str, tuple[Any, Any, dict[st
 
     def true(poses: Any, T_MH: Any) -> ProjectionMatrices:
         P = eq5_matrices(fine, T_HT=run.T_HT, T_MH=T_MH, alpha=poses.alpha)
-        return ProjectionMatrices(P=P, n_u=fine.n_u, n_v=fine.n_v, p_u=fine.p_u, p_v=fine.p_v, pose_id=poses.pose_id,
-                                  scanner=fine).binned(binning)
+        return ProjectionMatrices(
+            P=P, n_u=fine.n_u, n_v=fine.n_v, p_u=fine.p_u, p_v=fine.p_v, pose_id=poses.pose_id, scanner=fine
+        ).binned(binning)
 
     tilted, round_ = true(scan, real_T_MH(scan, MAGNIFICATION)), true(circle, circle.T_MH)
     return {
@@ -149,6 +153,7 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
     grid = VoxelGrid(shape=(n_z, n, n), spacing=side)
     found = {}
     for k, (name, (P_true, P_used, how)) in enumerate(cases.items()):
+
         def surface(P_true: Any = P_true, P_used: Any = P_used, how: dict[str, Any] = how) -> dict[str, Any]:
             images = [cylinder_integrals(P, scanner).astype(np.float32) for P in P_true.P]
             volume = reconstruct(images, P_used, grid, images_are="line-integrals", engine="cpu", **how)
@@ -163,17 +168,44 @@ def rows_of(found: dict[str, Array]) -> list[StudyRow]:
     """Largest deviation and the part with the tilt's period, of each volume."""
     circle, theirs, ours, true, sequential = found.values()
     return [
-        StudyRow(group="3D scan", quantity="largest deviation of the surface", unit="um", source="sec. 6.3, fig. 12",
-                 printed=PRINTED_CYLINDER_UM, paper_method=float(np.abs(theirs).max()), best=float(np.abs(ours).max())),
-        StudyRow(group="3D scan", quantity="part with seven periods a turn", unit="um", source="sec. 6.3, fig. 12",
-                 paper_method=periodic_part(theirs), best=periodic_part(ours), note="printed: periodic, no figure"),
-        StudyRow(group="3D scan", quantity="largest deviation with the true matrices", unit="um",
-                 best=float(np.abs(true).max())),
-        StudyRow(group="3D scan", quantity="part with seven periods with the true matrices", unit="um",
-                 best=periodic_part(true)),
-        StudyRow(group="circular scan", quantity="largest deviation of the surface", unit="um",
-                 paper_method=float(np.abs(sequential).max()), best=float(np.abs(circle).max()),
-                 note="paper's method: SART in sequential order"),
+        StudyRow(
+            group="3D scan",
+            quantity="largest deviation of the surface",
+            unit="um",
+            source="sec. 6.3, fig. 12",
+            printed=PRINTED_CYLINDER_UM,
+            paper_method=float(np.abs(theirs).max()),
+            best=float(np.abs(ours).max()),
+        ),
+        StudyRow(
+            group="3D scan",
+            quantity="part with seven periods a turn",
+            unit="um",
+            source="sec. 6.3, fig. 12",
+            paper_method=periodic_part(theirs),
+            best=periodic_part(ours),
+            note="printed: periodic, no figure",
+        ),
+        StudyRow(
+            group="3D scan",
+            quantity="largest deviation with the true matrices",
+            unit="um",
+            best=float(np.abs(true).max()),
+        ),
+        StudyRow(
+            group="3D scan",
+            quantity="part with seven periods with the true matrices",
+            unit="um",
+            best=periodic_part(true),
+        ),
+        StudyRow(
+            group="circular scan",
+            quantity="largest deviation of the surface",
+            unit="um",
+            paper_method=float(np.abs(sequential).max()),
+            best=float(np.abs(circle).max()),
+            note="paper's method: SART in sequential order",
+        ),
     ]
 
 
@@ -183,12 +215,23 @@ def checks_of(found: dict[str, Array]) -> list[StudyCheck]:
     spectrum = np.abs(np.fft.rfft(theirs))
     loudest = int(np.argmax(spectrum))
     return [
-        StudyCheck(statement="by the paper's method the deviations repeat with the tilt's seven periods",
-                   found=f"the strongest part has {loudest} periods", holds=loudest % PERIODS == 0),
-        check_below("by our best the part with seven periods is within 1.2 x of what the true matrices give",
-                    periodic_part(ours) / periodic_part(true), 1.2, "x"),
-        check_below("by our best the surface is within 1.2 x of what the true matrices give (rms)",
-                    float(np.std(ours) / np.std(true)), 1.2, "x"),
+        StudyCheck(
+            statement="by the paper's method the deviations repeat with the tilt's seven periods",
+            found=f"the strongest part has {loudest} periods",
+            holds=loudest % PERIODS == 0,
+        ),
+        check_below(
+            "by our best the part with seven periods is within 1.2 x of what the true matrices give",
+            periodic_part(ours) / periodic_part(true),
+            1.2,
+            "x",
+        ),
+        check_below(
+            "by our best the surface is within 1.2 x of what the true matrices give (rms)",
+            float(np.std(ours) / np.std(true)),
+            1.2,
+            "x",
+        ),
     ]
 
 
@@ -202,6 +245,7 @@ def figure_of(found: dict[str, Array]) -> Figure:
     return Figure(
         title="Surface of a cylinder",
         meaning="Radius less its mean by angle, um: SART by the paper's method, FDK by ours.",
-        look_for="Seven waves by the paper's method; by our best no more than the true matrices leave.", data=data,
+        look_for="Seven waves by the paper's method; by our best no more than the true matrices leave.",
+        data=data,
         layout=layout(xaxis=axis("angle / deg"), yaxis=axis("deviation / um")),
     )

@@ -42,9 +42,7 @@ def paper_scanner(magnification: float = 5.3) -> Scanner:
     """
     voxel = {5.3: 0.0756, 2.7: 0.1482}[magnification]
     d_SD, p = 1500.0, 0.2
-    return Scanner(
-        d_SD=d_SD, d_SR=d_SD * voxel / (2 * p), p_u=p, p_v=p, u_0=1021.37, v_0=1026.81, n_u=2048, n_v=2048
-    )
+    return Scanner(d_SD=d_SD, d_SR=d_SD * voxel / (2 * p), p_u=p, p_v=p, u_0=1021.37, v_0=1026.81, n_u=2048, n_v=2048)
 
 
 def demo_setup(*, grid: int = 2, views: int = 180, small: bool = False) -> DemoSetup:

@@ -50,21 +50,44 @@ def by_pose(title: str, meaning: str, look_for: str, d: Array, poses: PoseSequen
     for name, colour in ROTATION_COLOURS.items():
         k = np.flatnonzero(groups == name)
         if k.size:
-            data.append({"type": "scatter", "mode": "markers", "name": f"rotation {name}", "x": k + 1, "y": d[k],
-                         "marker": {"size": 7, "color": colour}})
-    return Figure(title=title, meaning=meaning, look_for=look_for, data=data,
-                  layout=layout(xaxis=axis("pose"), yaxis=axis("d_k / px", rangemode="tozero")))
+            data.append(
+                {
+                    "type": "scatter",
+                    "mode": "markers",
+                    "name": f"rotation {name}",
+                    "x": k + 1,
+                    "y": d[k],
+                    "marker": {"size": 7, "color": colour},
+                }
+            )
+    return Figure(
+        title=title,
+        meaning=meaning,
+        look_for=look_for,
+        data=data,
+        layout=layout(xaxis=axis("pose"), yaxis=axis("d_k / px", rangemode="tozero")),
+    )
 
 
 def checks_of(a: dict[str, float], b: dict[str, float], best: dict[str, float], floor: float) -> list[StudyCheck]:
     """Homogeneous in (a), y far above the rest in (b), and homogeneous again by our best."""
     return [
-        check_below("(a) by the paper's method no rotation stands out (largest over smallest rms)",
-                    max(a.values()) / min(a.values()), 1.5, "x"),
-        check_between("(b) by the paper's method rotations about y carry the residuals, above 0.8 px", b["y"], 0.8,
-                      1.0, "px"),
-        check_between("(b) by the paper's method poses without rotation are as printed, 0.031 px", b[NO_ROTATION],
-                      0.02, 0.045, "px"),
+        check_below(
+            "(a) by the paper's method no rotation stands out (largest over smallest rms)",
+            max(a.values()) / min(a.values()),
+            1.5,
+            "x",
+        ),
+        check_between(
+            "(b) by the paper's method rotations about y carry the residuals, above 0.8 px", b["y"], 0.8, 1.0, "px"
+        ),
+        check_between(
+            "(b) by the paper's method poses without rotation are as printed, 0.031 px",
+            b[NO_ROTATION],
+            0.02,
+            0.045,
+            "px",
+        ),
         check_between("(b) by the paper's method rotations about z are as printed, 0.144 px", b["z"], 0.11, 0.18, "px"),
         check_below("(b) by our best no rotation stands above 1.5 x the floor", max(best.values()) / floor, 1.5, "x"),
     ]
@@ -84,28 +107,56 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
     by_axis = {
         "a": rms_by_axis(a.d, poses),
         "a best": rms_by_axis(a_best.d, poses.select(poses.index_of(a_best.pose_id))),
-        "b": rms_by_axis(b.paper_method.d, poses), "b best": rms_by_axis(b.best.d, used),
+        "b": rms_by_axis(b.paper_method.d, poses),
+        "b best": rms_by_axis(b.best.d, used),
     }
     rows = [
-        StudyRow(group="(a) perfect manipulator", quantity="d_rms_opt", unit="px",
-                 source=f"table 1, row {list(PRINTED).index((MAGNIFICATION, n)) + 1}",
-                 printed=PRINTED[MAGNIFICATION, n][0], paper_method=a.d_rms, best=a_best.d_rms)
+        StudyRow(
+            group="(a) perfect manipulator",
+            quantity="d_rms_opt",
+            unit="px",
+            source=f"table 1, row {list(PRINTED).index((MAGNIFICATION, n)) + 1}",
+            printed=PRINTED[MAGNIFICATION, n][0],
+            paper_method=a.d_rms,
+            best=a_best.d_rms,
+        )
     ]
     for letter, group in (("a", "(a) perfect manipulator"), ("b", "(b) manipulator that errs")):
         for name, value in by_axis[letter].items():
             printed = PRINTED_RMS.get(name) if letter == "b" else None
             rows.append(
-                StudyRow(group=group, quantity=f"rms of d_k, rotation {name}", unit="px", printed=printed,
-                         source="sec. 5.2" if printed or (letter, name) == ("b", "y") else "",
-                         paper_method=value, best=by_axis[f"{letter} best"][name],
-                         note="printed: values above 0.8" if (letter, name) == ("b", "y") else "")
+                StudyRow(
+                    group=group,
+                    quantity=f"rms of d_k, rotation {name}",
+                    unit="px",
+                    printed=printed,
+                    source="sec. 5.2" if printed or (letter, name) == ("b", "y") else "",
+                    paper_method=value,
+                    best=by_axis[f"{letter} best"][name],
+                    note="printed: values above 0.8" if (letter, name) == ("b", "y") else "",
+                )
             )
     figures = (
-        by_pose("Fig. 8 (a): perfect manipulator", "d_k by the paper's method from simulated radiographs.",
-                "No colour stands out: only the detection's own error is left.", a.d, poses),
-        by_pose("Fig. 8 (b): manipulator that errs", "d_k by the paper's method, the virtual hexapod.",
-                "Rotations about y stand far above the rest.", b.paper_method.d, poses),
-        by_pose("Fig. 8 (b) with the errors identified", "d_k by our best, the same radiographs.",
-                "The pattern is gone; what is left is the plate's scatter. Note the axis.", b.best.d, used),
+        by_pose(
+            "Fig. 8 (a): perfect manipulator",
+            "d_k by the paper's method from simulated radiographs.",
+            "No colour stands out: only the detection's own error is left.",
+            a.d,
+            poses,
+        ),
+        by_pose(
+            "Fig. 8 (b): manipulator that errs",
+            "d_k by the paper's method, the virtual hexapod.",
+            "Rotations about y stand far above the rest.",
+            b.paper_method.d,
+            poses,
+        ),
+        by_pose(
+            "Fig. 8 (b) with the errors identified",
+            "d_k by our best, the same radiographs.",
+            "The pattern is gone; what is left is the plate's scatter. Note the axis.",
+            b.best.d,
+            used,
+        ),
     )
     return rows, checks_of(by_axis["a"], by_axis["b"], by_axis["b best"], b.floor), figures, NOTES

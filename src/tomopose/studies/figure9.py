@@ -76,26 +76,52 @@ def figures_of(paths: Mapping[float, tuple[Path, Path]]) -> list[Figure]:
     for magnification, (tilted, circle) in paths.items():
         name = f"M {magnification}, {OBJECTS[magnification]}"
         data = [
-            {"type": "scatter3d", "mode": "lines", "name": label, "x": p.source[:, 0], "y": p.source[:, 1],
-             "z": p.source[:, 2], "line": {"color": colour, "width": 4}}
+            {
+                "type": "scatter3d",
+                "mode": "lines",
+                "name": label,
+                "x": p.source[:, 0],
+                "y": p.source[:, 1],
+                "z": p.source[:, 2],
+                "line": {"color": colour, "width": 4},
+            }
             for label, p, colour in (("3D scan", tilted, ACCENT), ("circular scan", circle, ALERT))
         ]
-        scene = {"xaxis": space_axis("x / mm"), "yaxis": space_axis("y / mm"), "zaxis": space_axis("z / mm"),
-                 "aspectmode": "data"}
+        scene = {
+            "xaxis": space_axis("x / mm"),
+            "yaxis": space_axis("y / mm"),
+            "zaxis": space_axis("z / mm"),
+            "aspectmode": "data",
+        }
         figures.append(
-            Figure(title=f"Source path, {name}", meaning="Positions of the source seen from the object.",
-                   look_for="Seven periods up and down around the circle.", data=data, layout=layout(scene=scene),
-                   height=460)
+            Figure(
+                title=f"Source path, {name}",
+                meaning="Positions of the source seen from the object.",
+                look_for="Seven periods up and down around the circle.",
+                data=data,
+                layout=layout(scene=scene),
+                height=460,
+            )
         )
     tilts = [
-        {"type": "scatter", "mode": "lines", "name": f"M {m}", "x": np.degrees(p.alpha), "y": np.degrees(p.tilt),
-         "line": {"color": colour, "width": 2}}
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "name": f"M {m}",
+            "x": np.degrees(p.alpha),
+            "y": np.degrees(p.tilt),
+            "line": {"color": colour, "width": 2},
+        }
         for (m, (p, _)), colour in zip(paths.items(), (ACCENT, ORANGE), strict=True)
     ]
     figures.append(
-        Figure(title="Tilt of the object", meaning="Turn about y_W by table angle: by it the source climbs over the "
-               "object.", look_for="The triangle of eq. (11) and the sine with its offset.",
-               data=tilts, layout=layout(xaxis=axis("table angle / deg"), yaxis=axis("tilt / deg")))
+        Figure(
+            title="Tilt of the object",
+            meaning="Turn about y_W by table angle: by it the source climbs over the object.",
+            look_for="The triangle of eq. (11) and the sine with its offset.",
+            data=tilts,
+            layout=layout(xaxis=axis("table angle / deg"), yaxis=axis("tilt / deg")),
+        )
     )
     return figures
 
@@ -125,20 +151,52 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
         both = (as_set, as_meant)
         for quantity, printed, extreme in (("largest tilt", high, np.max), ("smallest tilt", low, np.min)):
             found = [float(np.degrees(extreme(p.tilt))) for p in both]
-            rows.append(StudyRow(group=group, quantity=quantity, unit="deg", source="sec. 6.1", printed=printed,
-                                 paper_method=found[0], best=found[1]))
+            rows.append(
+                StudyRow(
+                    group=group,
+                    quantity=quantity,
+                    unit="deg",
+                    source="sec. 6.1",
+                    printed=printed,
+                    paper_method=found[0],
+                    best=found[1],
+                )
+            )
         periods = [crossings(p.tilt) for p in both]
         rows += [
-            StudyRow(group=group, quantity="periods", unit="1", source="sec. 6.1", printed=PERIODS,
-                     paper_method=periods[0], best=periods[1]),
-            StudyRow(group=group, quantity="largest error of the tilt", unit="mrad", paper_method=1e3 * off,
-                     best=1e3 * best, note="driven against meant"),
-            StudyRow(group=group, quantity="voxel side", unit="um", source="table 3", printed=voxel,
-                     best=1e3 * 2 * scanner.p_u / scanner.magnification, note="gives d_SR; not a test"),
+            StudyRow(
+                group=group,
+                quantity="periods",
+                unit="1",
+                source="sec. 6.1",
+                printed=PERIODS,
+                paper_method=periods[0],
+                best=periods[1],
+            ),
+            StudyRow(
+                group=group,
+                quantity="largest error of the tilt",
+                unit="mrad",
+                paper_method=1e3 * off,
+                best=1e3 * best,
+                note="driven against meant",
+            ),
+            StudyRow(
+                group=group,
+                quantity="voxel side",
+                unit="um",
+                source="table 3",
+                printed=voxel,
+                best=1e3 * 2 * scanner.p_u / scanner.magnification,
+                note="gives d_SR; not a test",
+            ),
         ]
         checks += [
-            StudyCheck(statement=f"the path has the printed seven periods ({group})", found=f"{periods[1]}",
-                       holds=periods == [PERIODS, PERIODS]),
+            StudyCheck(
+                statement=f"the path has the printed seven periods ({group})",
+                found=f"{periods[1]}",
+                holds=periods == [PERIODS, PERIODS],
+            ),
             check_below(f"with the calibrated R_HT the tilt is the one meant ({group})", 1e3 * best, 1e-6, "mrad"),
         ]
         progress(k + 1, len(PRINTED))

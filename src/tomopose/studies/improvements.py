@@ -86,8 +86,10 @@ class Experiment:
 def mixed_poses(rng: np.random.Generator, *, balls: int = 1, n: int = 189) -> PoseSequence:
     """Any positions and tilts within the paper's travel, at four table angles; balls by turns."""
     return PoseSequence.from_table(
-        rng.uniform(-10, 10, (n, 3)), rng.uniform(-5, 5, (n, 3)),
-        alpha=np.array(QUARTERS)[np.arange(n) * 4 // n], ball_id=np.arange(n) % balls,
+        rng.uniform(-10, 10, (n, 3)),
+        rng.uniform(-5, 5, (n, 3)),
+        alpha=np.array(QUARTERS)[np.arange(n) * 4 // n],
+        ball_id=np.arange(n) % balls,
     )
 
 
@@ -98,8 +100,13 @@ def hexapod_experiment(poses: Callable[[np.random.Generator], PoseSequence], bal
         T_HT = demo_setup().T_HT
         exact = replace(typical_hexapod(), scale_sigma=0.0, geometry_sigma=0.0)  # the controller knows its geometry
         return Experiment(
-            machine=exact, believed=typical_hexapod(), p=rng.standard_normal(len(exact.names)) * exact.sigma,
-            poses=poses(rng), scan=tilted_scan(SCAN_VIEWS, sine_tilt, R_HT=T_HT.R), T_HT=T_HT, balls=np.array(balls),
+            machine=exact,
+            believed=typical_hexapod(),
+            p=rng.standard_normal(len(exact.names)) * exact.sigma,
+            poses=poses(rng),
+            scan=tilted_scan(SCAN_VIEWS, sine_tilt, R_HT=T_HT.R),
+            T_HT=T_HT,
+            balls=np.array(balls),
             centre=np.zeros(3),
         )
 
@@ -120,10 +127,14 @@ def robot_experiment(rng: np.random.Generator, *, n: int = 200) -> Experiment:
     angle = np.linspace(-2.9, 2.9, SCAN_VIEWS)
     turns = R_z(rng.uniform(-2.9, 2.9, n)) @ R_y(np.radians(rng.uniform(-20, 20, n)))
     return Experiment(
-        machine=robot, believed=robot, p=rng.standard_normal(len(robot.names)) * robot.sigma,
+        machine=robot,
+        believed=robot,
+        p=rng.standard_normal(len(robot.names)) * robot.sigma,
         poses=poses_at(turns, rng.uniform(-12, 12, (n, 3)), ball_id=np.arange(n) % 2, alpha=np.zeros(n)),
         scan=poses_at(R_z(angle) @ R_y(np.radians(8) * np.sin(7 * angle)), np.zeros((SCAN_VIEWS, 3))),
-        T_HT=replace(mount, t=-(mount.R @ home.t[0])), balls=np.array(ROBOT_BALLS), centre=np.array([0.0, 0.0, 40.0]),
+        T_HT=replace(mount, t=-(mount.R @ home.t[0])),
+        balls=np.array(ROBOT_BALLS),
+        centre=np.array([0.0, 0.0, 40.0]),
         distances={(0, 1): (float(np.linalg.norm(np.subtract(*ROBOT_BALLS))), DISTANCE_U_MM)},
     )
 
@@ -158,12 +169,16 @@ def c_arm_experiment(rng: np.random.Generator, *, n: int = 100) -> Experiment:
     machine = InverseManipulator(machine=arm)
     angles = np.radians(rng.uniform(-1, 1, (2, n)) * [[45.0], [105.0]])
     return Experiment(
-        machine=machine, believed=machine, p=rng.standard_normal(len(arm.names)) * arm.sigma,
+        machine=machine,
+        believed=machine,
+        p=rng.standard_normal(len(arm.names)) * arm.sigma,
         poses=poses_at(rng.uniform(-20, 20, n), *angles, ball_id=np.arange(n) % 2, alpha=np.zeros(n)),
         scan=poses_at(np.zeros(SCAN_VIEWS), np.radians(8) * np.sin(7 * turn), turn),
         T_HT=RigidTransform.from_angles([0.02, -0.03, 1.6], [1.0, -2.0, 1.5], source=Frame.H, target=Frame.T),
-        balls=np.array(C_ARM_BALLS), centre=np.zeros(3),
-        distances={(0, 1): (float(np.linalg.norm(np.subtract(*C_ARM_BALLS))), DISTANCE_U_MM)}, scanner=C_ARM,
+        balls=np.array(C_ARM_BALLS),
+        centre=np.zeros(3),
+        distances={(0, 1): (float(np.linalg.norm(np.subtract(*C_ARM_BALLS))), DISTANCE_U_MM)},
+        scanner=C_ARM,
     )
 
 
@@ -198,8 +213,9 @@ def solve_case(name: str, seed: int) -> dict[str, Any]:
     scanner = e.scanner
     seen = observe(e, rng)
     rigid = calibrate(scanner, e.poses, seen, model="rigid", hypotheses=False, raise_on_failure=False)
-    best = calibrate_kinematic(scanner, e.poses, seen, rigid=rigid, manipulator=e.believed, model="kinematic",
-                               distances=e.distances)
+    best = calibrate_kinematic(
+        scanner, e.poses, seen, rigid=rigid, manipulator=e.believed, model="kinematic", distances=e.distances
+    )
     truth = real_motion(e.machine, e.scan, e.p)
     P_true = eq5_matrices(scanner, T_HT=e.T_HT, T_MH=truth.T_MH, alpha=alpha_of(e.scan))
     points = (scanner.T_TW(0.0) @ e.T_HT).apply(e.centre + object_points())
@@ -218,8 +234,13 @@ def table_row() -> StudyRow:
         seen = BallObservations.from_sigma(x, DETECTION_PX / np.sqrt(2), pose_id=poses.pose_id)
         found = calibrate(scanner, poses, seen, model="rigid", hypotheses=False, pose_noise=None)
         u.append(1e3 * sigmas_of(found)["t_HT_x"])
-    return StudyRow(group="table at 90 degrees", quantity="standard uncertainty of t_HT_x, 112 poses", unit="um",
-                    paper_method=u[0], best=u[1])
+    return StudyRow(
+        group="table at 90 degrees",
+        quantity="standard uncertainty of t_HT_x, 112 poses",
+        unit="um",
+        paper_method=u[0],
+        best=u[1],
+    )
 
 
 def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any, Any, Any, Any]:
@@ -227,8 +248,13 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
     table = table_row()
     gain = (table.paper_method or 0.0) / (table.best or np.inf)
     rows = [table]
-    checks = [StudyCheck(statement="turning the table for half of the poses makes t_HT along the beam more certain",
-                         found=f"{gain:.3g} times", holds=gain > 1.0)]
+    checks = [
+        StudyCheck(
+            statement="turning the table for half of the poses makes t_HT along the beam more certain",
+            found=f"{gain:.3g} times",
+            holds=gain > 1.0,
+        )
+    ]
     seeds = SEEDS[scale]
     for k, name in enumerate(CASES):
         found = []
@@ -236,19 +262,34 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
             found.append(steps.of(f"case-{k}-{s}", lambda name=name, s=s: solve_case(name, seed + s)))  # type: ignore[misc]
             progress(k * seeds + s + 1, len(CASES) * seeds)
         rigid, best, u = (float(np.sqrt(np.mean([f[side] ** 2 for f in found]))) for side in ("rigid", "best", "u"))
-        rows.append(StudyRow(group=name, quantity="error of the tilted scan", unit="um", paper_method=rigid,
-                             best=best, u=u, note=f"{seeds} machines"))
+        rows.append(
+            StudyRow(
+                group=name,
+                quantity="error of the tilted scan",
+                unit="um",
+                paper_method=rigid,
+                best=best,
+                u=u,
+                note=f"{seeds} machines",
+            )
+        )
         checks += [
             check_below(f"identifying the errors makes the scan three times better ({name})", best / rigid, 1 / 3, ""),
             check_below(f"the scan's error is within twice its stated uncertainty ({name})", best / u, 2.0, "u"),
         ]
     scans = rows[1:]
     figure = Figure(
-        title="Error of the tilted scan", meaning="rms at the object's corners, um at the object.",
+        title="Error of the tilted scan",
+        meaning="rms at the object's corners, um at the object.",
         look_for="Each step of the outlook against the same scan with the poses trusted.",
         data=[
-            {"type": "bar", "name": name, "x": [r.group for r in scans], "y": [getattr(r, side) for r in scans],
-             "marker": {"color": colour}}
+            {
+                "type": "bar",
+                "name": name,
+                "x": [r.group for r in scans],
+                "y": [getattr(r, side) for r in scans],
+                "marker": {"color": colour},
+            }
             for name, side, colour in (("poses trusted", "paper_method", ORANGE), ("by our best", "best", ACCENT))
         ],
         layout=layout(xaxis=axis(type="category"), yaxis=axis("error / um", type="log"), barmode="group"),

@@ -60,8 +60,16 @@ def run_study(
     begin = time.perf_counter()
     rows, checks, figures, notes = module.run(scale, seed, steps, progress or (lambda done, total: None))
     return StudyResult(
-        name=name, title=module.TITLE, paper=PAPER[name], question=module.QUESTION, scale=scale, seed=seed,
-        rows=tuple(rows), checks=tuple(checks), figures=tuple(figures), notes=tuple(notes),
+        name=name,
+        title=module.TITLE,
+        paper=PAPER[name],
+        question=module.QUESTION,
+        scale=scale,
+        seed=seed,
+        rows=tuple(rows),
+        checks=tuple(checks),
+        figures=tuple(figures),
+        notes=tuple(notes),
         seconds=time.perf_counter() - begin,
         provenance=provenance(arguments={"study": name, "scale": scale}, seed=seed),
     )

@@ -82,7 +82,11 @@ def ball_run(magnification: float, n: int, seed: int) -> BallRun:
     poses = pose_grid(n)
     entropy = np.random.SeedSequence([seed, round(10 * magnification), n])
     return BallRun(
-        scanner=paper_scanner(magnification), T_HT=setup.T_HT, t=setup.t, poses=poses, T_MH=poses.T_MH,
+        scanner=paper_scanner(magnification),
+        T_HT=setup.T_HT,
+        t=setup.t,
+        poses=poses,
+        T_MH=poses.T_MH,
         seed=int(entropy.generate_state(1)[0]),
     )
 
@@ -96,8 +100,11 @@ def solve_case(case: Case, seed: int, steps: Steps, progress: Progress) -> dict[
     out = {}
     for name, calibration, centres in (("paper_method", theirs, observations), ("best", ours, measured.best)):
         out[name] = {
-            "d_rms_opt": calibration.d_rms, "d_rms_exact": exact_rms(run, centres), "d": calibration.d,
-            "errors": errors_of(calibration, run), "u": sigmas_of(calibration),
+            "d_rms_opt": calibration.d_rms,
+            "d_rms_exact": exact_rms(run, centres),
+            "d": calibration.d,
+            "errors": errors_of(calibration, run),
+            "u": sigmas_of(calibration),
         }
     return out
 
@@ -107,17 +114,30 @@ def rows_of(case: Case, found: Mapping[str, Any]) -> list[StudyRow]:
     printed = PRINTED[case.magnification, case.n]
     theirs, ours = found["paper_method"], found["best"]
     rows = [
-        StudyRow(group=case.group, quantity=name, unit="px", source=case.source, printed=printed[k],
-                 paper_method=theirs[name], best=ours[name])
+        StudyRow(
+            group=case.group,
+            quantity=name,
+            unit="px",
+            source=case.source,
+            printed=printed[k],
+            paper_method=theirs[name],
+            best=ours[name],
+        )
         for k, name in enumerate(("d_rms_opt", "d_rms_exact"))
     ]
     for k, name in enumerate(NAMES):
         factor, unit = FACTOR[name[0]]
         rows.append(
             StudyRow(
-                group=case.group, quantity=f"error of {name}", unit=unit, source=case.source, printed=printed[2 + k],
-                paper_method=factor * theirs["errors"][name], u_paper_method=factor * theirs["u"][name],
-                best=factor * ours["errors"][name], u=factor * ours["u"][name],
+                group=case.group,
+                quantity=f"error of {name}",
+                unit=unit,
+                source=case.source,
+                printed=printed[2 + k],
+                paper_method=factor * theirs["errors"][name],
+                u_paper_method=factor * theirs["u"][name],
+                best=factor * ours["errors"][name],
+                u=factor * ours["u"][name],
             )
         )
     return rows
@@ -133,23 +153,40 @@ def checks_of(rows: list[StudyRow]) -> tuple[StudyCheck, ...]:
     printed = np.array([r.printed for r in errors])
     size = float(np.sqrt(np.mean(theirs**2) / np.mean(printed**2)))
     return (
-        check_between("by the paper's method the smallest d_rms_exact is about the printed 0.020 to 0.024 px",
-                      min(r.paper_method or 0.0 for r in exact), 0.015, 0.03, "px"),
-        check_between("by the paper's method the largest d_rms_exact is about the printed 0.020 to 0.024 px",
-                      max(r.paper_method or 0.0 for r in exact), 0.015, 0.03, "px"),
-        check_below("by our best d_rms_exact is 0.0012 px or better", max(r.best or 0.0 for r in exact),
-                    GOAL_EXACT_PX, "px"),
-        check_between("by the paper's method the nine errors are of the printed size (ratio of rms)", size, 1 / 3, 3,
-                      ""),
-        StudyCheck(statement="by our best the nine errors are ten times smaller or better (ratio of rms)",
-                   found=f"{gain:.3g} times", holds=gain >= GOAL_GAIN),
-        check_below(f"by our best all errors lie within {COVERAGE:g} stated standard uncertainties", worst, COVERAGE,
-                    "u"),
+        check_between(
+            "by the paper's method the smallest d_rms_exact is about the printed 0.020 to 0.024 px",
+            min(r.paper_method or 0.0 for r in exact),
+            0.015,
+            0.03,
+            "px",
+        ),
+        check_between(
+            "by the paper's method the largest d_rms_exact is about the printed 0.020 to 0.024 px",
+            max(r.paper_method or 0.0 for r in exact),
+            0.015,
+            0.03,
+            "px",
+        ),
+        check_below(
+            "by our best d_rms_exact is 0.0012 px or better", max(r.best or 0.0 for r in exact), GOAL_EXACT_PX, "px"
+        ),
+        check_between(
+            "by the paper's method the nine errors are of the printed size (ratio of rms)", size, 1 / 3, 3, ""
+        ),
+        StudyCheck(
+            statement="by our best the nine errors are ten times smaller or better (ratio of rms)",
+            found=f"{gain:.3g} times",
+            holds=gain >= GOAL_GAIN,
+        ),
+        check_below(
+            f"by our best all errors lie within {COVERAGE:g} stated standard uncertainties", worst, COVERAGE, "u"
+        ),
     )
 
 
 def figures_of(found: Mapping[Case, Mapping[str, Any]]) -> tuple[Figure, ...]:
     """Errors of the nine parameters, both ways, as bars over a logarithmic axis."""
+
     def trace(name: str, side: str, colour: str) -> dict[str, Any]:
         labels, values = [], []
         for case, content in found.items():
@@ -157,22 +194,37 @@ def figures_of(found: Mapping[Case, Mapping[str, Any]]) -> tuple[Figure, ...]:
                 factor, _ = FACTOR[key[0]]
                 labels.append(f"{case.group}, {key}")
                 values.append(abs(factor * content[side]["errors"][key]))
-        return {"type": "scatter", "mode": "markers", "name": name, "x": list(range(len(values))), "y": values,
-                "text": labels, "marker": {"color": colour, "size": 7},
-                "hovertemplate": "%{text}: %{y:.3g}<extra></extra>"}
+        return {
+            "type": "scatter",
+            "mode": "markers",
+            "name": name,
+            "x": list(range(len(values))),
+            "y": values,
+            "text": labels,
+            "marker": {"color": colour, "size": 7},
+            "hovertemplate": "%{text}: %{y:.3g}<extra></extra>",
+        }
 
     printed = [abs(v) for case in found for v in PRINTED[case.magnification, case.n][2:]]
     data = [
-        {"type": "scatter", "mode": "markers", "name": "printed", "x": list(range(len(printed))), "y": printed,
-         "marker": {"color": SOFT, "size": 7, "symbol": "x"}},
-        trace("by the paper's method", "paper_method", ORANGE), trace("by our best", "best", ACCENT),
+        {
+            "type": "scatter",
+            "mode": "markers",
+            "name": "printed",
+            "x": list(range(len(printed))),
+            "y": printed,
+            "marker": {"color": SOFT, "size": 7, "symbol": "x"},
+        },
+        trace("by the paper's method", "paper_method", ORANGE),
+        trace("by our best", "best", ACCENT),
     ]
     return (
         Figure(
             title="Errors of mount and ball",
             meaning="Absolute errors of t_HT and t (um) and of the rotation (urad), nine for each row of the table.",
             look_for="The paper's method lies among the printed values; ours lies a decade or more below.",
-            data=data, layout=layout(xaxis=axis("parameter, row by row"), yaxis=axis("error / um, urad", type="log")),
+            data=data,
+            layout=layout(xaxis=axis("parameter, row by row"), yaxis=axis("error / um, urad", type="log")),
         ),
     )
 
@@ -183,6 +235,7 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
     total, before = sum(7 * c.n**3 for c in todo), 0
     found, rows = {}, []
     for case in todo:
+
         def count(done: int, _: int, before: int = before) -> None:
             progress(before + done, total)
 

@@ -63,15 +63,28 @@ def rows_of(magnification: float, runs: tuple[SolvedRun, SolvedRun]) -> list[Stu
     for k, solved in enumerate(runs):
         source = f"table 2, row {LAST_ROW[magnification] - 1 + k}"
         rows.append(
-            StudyRow(group=group, quantity=f"d_rms_opt, run {k + 1}", unit="px", source=source,
-                     printed=PRINTED_D_RMS[magnification][k], paper_method=solved.paper_method.d_rms,
-                     best=solved.best.d_rms, note=f"floor {solved.floor:.4f} px")
+            StudyRow(
+                group=group,
+                quantity=f"d_rms_opt, run {k + 1}",
+                unit="px",
+                source=source,
+                printed=PRINTED_D_RMS[magnification][k],
+                paper_method=solved.paper_method.d_rms,
+                best=solved.best.d_rms,
+                note=f"floor {solved.floor:.4f} px",
+            )
         )
     for k, solved in enumerate(runs):
         errors = [scan_error_um(c, solved.run, magnification) for c in (solved.paper_method, solved.best)]
         rows.append(
-            StudyRow(group=group, quantity=f"error of the tilted scan, run {k + 1}", unit="um",
-                     paper_method=errors[0], best=errors[1], note="rms at the object's corners, rigid pose removed")
+            StudyRow(
+                group=group,
+                quantity=f"error of the tilted scan, run {k + 1}",
+                unit="um",
+                paper_method=errors[0],
+                best=errors[1],
+                note="rms at the object's corners, rigid pose removed",
+            )
         )
     theirs, ours = (compare(*(getattr(s, side) for s in runs)) for side in ("paper_method", "best"))
     for k, name in enumerate(NAMES):
@@ -79,9 +92,14 @@ def rows_of(magnification: float, runs: tuple[SolvedRun, SolvedRun]) -> list[Stu
         i, j = theirs.names.index(name), ours.names.index(name)
         rows.append(
             StudyRow(
-                group=group, quantity=f"change of {name}", unit=unit, source=f"table 2, row {LAST_ROW[magnification]}",
-                printed=PRINTED_CHANGE[magnification][k], paper_method=factor * float(theirs.difference[i]),
-                u_paper_method=factor * float(theirs.u[i]), best=factor * float(ours.difference[j]),
+                group=group,
+                quantity=f"change of {name}",
+                unit=unit,
+                source=f"table 2, row {LAST_ROW[magnification]}",
+                printed=PRINTED_CHANGE[magnification][k],
+                paper_method=factor * float(theirs.difference[i]),
+                u_paper_method=factor * float(theirs.u[i]),
+                best=factor * float(ours.difference[j]),
                 u=factor * float(ours.u[j]),
                 note=f"probability by chance: {float(theirs.p[i]):.2g} paper's method, {float(ours.p[j]):.2g} ours",
             )
@@ -98,13 +116,20 @@ def checks_of(magnification: float, runs: tuple[SolvedRun, SolvedRun], rows: lis
     gain = min((r.paper_method or 0.0) / (r.best or np.inf) for r in rows if r.quantity.startswith("error of the"))
     p = compare(runs[0].best, runs[1].best).p_mount
     return [
-        check_between(f"by the paper's method d_rms_opt of both runs is as printed{at}", float(np.mean(d)), low, high,
-                      "px"),
+        check_between(
+            f"by the paper's method d_rms_opt of both runs is as printed{at}", float(np.mean(d)), low, high, "px"
+        ),
         check_below(f"by our best d_rms_opt is within {FLOOR_FACTOR:g} x of the floor{at}", over, FLOOR_FACTOR, "x"),
-        StudyCheck(statement=f"by our best the tilted scan's error is three times smaller or better{at}",
-                   found=f"{gain:.3g} times", holds=gain >= SCAN_GAIN),
-        StudyCheck(statement=f"by our best no change of the mount is claimed, where none was made{at}",
-                   found=f"probability by chance {p:.2g}", holds=p >= 0.01),
+        StudyCheck(
+            statement=f"by our best the tilted scan's error is three times smaller or better{at}",
+            found=f"{gain:.3g} times",
+            holds=gain >= SCAN_GAIN,
+        ),
+        StudyCheck(
+            statement=f"by our best no change of the mount is claimed, where none was made{at}",
+            found=f"probability by chance {p:.2g}",
+            holds=p >= 0.01,
+        ),
     ]
 
 
@@ -112,8 +137,11 @@ def figure_of(rows: list[StudyRow]) -> Figure:
     """Residuals as bars: printed, by the paper's method, by ours."""
     d = [r for r in rows if r.quantity.startswith("d_rms")]
     labels = [f"{r.group}, {r.quantity[-5:]}" for r in d]
-    sides = (("printed", "printed", SOFT), ("by the paper's method", "paper_method", ORANGE),
-             ("by our best", "best", ACCENT))
+    sides = (
+        ("printed", "printed", SOFT),
+        ("by the paper's method", "paper_method", ORANGE),
+        ("by our best", "best", ACCENT),
+    )
     return Figure(
         title="Reprojection error of both runs",
         meaning="d_rms_opt of eq. (8) on a logarithmic axis.",

@@ -53,13 +53,24 @@ def section(radius: float, half_height: float, n: tuple[int, int]) -> tuple[Arra
 def share_map(title: str, x: Array, z: Array, share: Array, lowest: float) -> Figure:
     """Share of planes met over the section."""
     return Figure(
-        title=title, meaning="Share of all planes through a point that meet the source's path; 1 is complete.",
+        title=title,
+        meaning="Share of all planes through a point that meet the source's path; 1 is complete.",
         look_for="The circular path loses planes with height; the tilted one should be 1 throughout.",
         data=[
-            {"type": "heatmap", "x": x, "y": z, "z": share, "zmin": lowest, "zmax": 1.0, "colorscale": SEQUENTIAL,
-             "colorbar": colour_bar("share")}
+            {
+                "type": "heatmap",
+                "x": x,
+                "y": z,
+                "z": share,
+                "zmin": lowest,
+                "zmax": 1.0,
+                "colorscale": SEQUENTIAL,
+                "colorbar": colour_bar("share"),
+            }
         ],
-        layout=layout(xaxis=axis("x / mm"), yaxis=axis("z / mm")), wide=False, height=440,
+        layout=layout(xaxis=axis("x / mm"), yaxis=axis("z / mm")),
+        wide=False,
+        height=440,
     )
 
 
@@ -82,8 +93,14 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
             share[name] = tuy_completeness(path, points, n_planes=planes).share.reshape(len(z), len(x))
             printed = 1.0 if (name, magnification) == ("3D scan", 5.3) else None
             rows += [
-                StudyRow(group=group, quantity=f"{name}, {what} share", unit="1", best=float(value),
-                         printed=printed, source="sec. 6.3, ref. [22]" if printed else "")
+                StudyRow(
+                    group=group,
+                    quantity=f"{name}, {what} share",
+                    unit="1",
+                    best=float(value),
+                    printed=printed,
+                    source="sec. 6.3, ref. [22]" if printed else "",
+                )
                 for what, value in (("mean", share[name].mean()), ("smallest", share[name].min()))
             ]
         lowest = float(min(s.min() for s in share.values()))
@@ -92,20 +109,28 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
         known = np.cos(np.arctan(np.abs(z) / d_SR))
         off = float(np.abs(share["circular scan"][:, len(x) // 2] - known).max())
         checks += [
-            check_below(f"on the axis the circular scan's share is the known one (largest difference, {group})", off,
-                        2e-3, ""),
-            StudyCheck(statement=f"the 3D scan meets every plane through the object ({group})",
-                       found=f"smallest share {share['3D scan'].min():.5f}", holds=bool(share["3D scan"].min() == 1)),
-            StudyCheck(statement=f"the circular scan does not ({group})",
-                       found=f"smallest share {share['circular scan'].min():.5f}",
-                       holds=bool(share["circular scan"].min() < 1)),
+            check_below(
+                f"on the axis the circular scan's share is the known one (largest difference, {group})", off, 2e-3, ""
+            ),
+            StudyCheck(
+                statement=f"the 3D scan meets every plane through the object ({group})",
+                found=f"smallest share {share['3D scan'].min():.5f}",
+                holds=bool(share["3D scan"].min() == 1),
+            ),
+            StudyCheck(
+                statement=f"the circular scan does not ({group})",
+                found=f"smallest share {share['circular scan'].min():.5f}",
+                holds=bool(share["circular scan"].min() < 1),
+            ),
         ]
         progress(k + 1, len(HALF_SIZE) + 2)
     _, views = tuy_discs.PLAN[scale]
     discs = {}
     for k, (name, scan) in enumerate(
-        (("circular scan", circular_scan(views)),
-         ("3D scan", tilted_scan(views, WAVES[tuy_discs.MAGNIFICATION], R_HT=demo_setup().T_HT.R)))
+        (
+            ("circular scan", circular_scan(views)),
+            ("3D scan", tilted_scan(views, WAVES[tuy_discs.MAGNIFICATION], R_HT=demo_setup().T_HT.R)),
+        )
     ):
         discs[name] = steps.of(f"discs-{k}", lambda scan=scan: tuy_discs.disc_profile(scan, scale))  # type: ignore[misc]
         progress(len(HALF_SIZE) + k + 1, len(HALF_SIZE) + 2)

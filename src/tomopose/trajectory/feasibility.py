@@ -43,8 +43,15 @@ class TravelLimits:
 
     @classmethod
     def symmetric(
-        cls, *, x: float = np.inf, y: float = np.inf, z: float = np.inf, rx: float = np.inf, ry: float = np.inf,
-        rz: float = np.inf, alpha: float = np.inf,
+        cls,
+        *,
+        x: float = np.inf,
+        y: float = np.inf,
+        z: float = np.inf,
+        rx: float = np.inf,
+        ry: float = np.inf,
+        rz: float = np.inf,
+        alpha: float = np.inf,
     ) -> TravelLimits:
         """From half ranges, mm and rad; an axis that is left out is not limited."""
         high = np.array([x, y, z, rx, ry, rz, alpha])

@@ -88,7 +88,12 @@ def simulated_errors(
 
 
 def virtual_volumes(
-    run: SimulatedRun, grid: VoxelGrid, *, draws: int, calibration: Calibration | None = None, seed: int = 0,
+    run: SimulatedRun,
+    grid: VoxelGrid,
+    *,
+    draws: int,
+    calibration: Calibration | None = None,
+    seed: int = 0,
     options: Mapping[str, Any] | None = None,
 ) -> Iterator[Volume]:
     """Reconstructions of the run, each with noise, place, size in voxels and believed matrices of its own; draw k is
@@ -103,13 +108,19 @@ def virtual_volumes(
         # What the scanner saw at size (x + shift) it sees at x, being so much smaller and the object moved.
         motion = np.diag([size, size, size, 1.0])
         motion[:3, 3] = size * shift
-        matrices = replace(found, P=found.P @ motion, p_u=found.p_u / size, p_v=found.p_v / size,
-                           scanner=None if found.scanner is None else _smaller(found.scanner, size))
+        matrices = replace(
+            found,
+            P=found.P @ motion,
+            p_u=found.p_u / size,
+            p_v=found.p_v / size,
+            scanner=None if found.scanner is None else _smaller(found.scanner, size),
+        )
         box = replace(grid, centre=grid.centre / size - shift, spacing=grid.spacing / size)
         images = [expose(signal(placed, i), run.detector, run.scanner, seed=noise, frame=i) for i in range(len(run))]
         white, dark = _levels(run, noise)
-        yield reconstruct(images, matrices, box, images_are="counts", white=white, dark=dark, consistency="off",
-                          **dict(options or {}))
+        yield reconstruct(
+            images, matrices, box, images_are="counts", white=white, dark=dark, consistency="off", **dict(options or {})
+        )
 
 
 def _placed(run: SimulatedRun, size: float, shift: Array) -> SimulatedRun:
@@ -150,16 +161,25 @@ def drawn_matrices(
         scanner, T_HT = _drawn(scanner, run.T_HT, calibration.tangent, delta)
         drawn = eq5_matrices(scanner, T_HT=T_HT, T_MH=_drawn_poses(run, calibration, delta), alpha=alpha)
         P = _object_held(drawn, eq5_matrices(run.scanner, T_HT=run.T_HT, T_MH=run.T_MH, alpha=alpha), grid)
-    return ProjectionMatrices(P=P, n_u=scanner.n_u, n_v=scanner.n_v, p_u=scanner.p_u, p_v=scanner.p_v,
-                              pose_id=run.poses.pose_id, scanner=scanner)
+    return ProjectionMatrices(
+        P=P,
+        n_u=scanner.n_u,
+        n_v=scanner.n_v,
+        p_u=scanner.p_u,
+        p_v=scanner.p_v,
+        pose_id=run.poses.pose_id,
+        scanner=scanner,
+    )
 
 
 def _require_same_detector(own: Scanner, calibration: Calibration) -> None:
     for name in ("n_u", "n_v", "p_u", "p_v"):
         a, b = getattr(own, name), getattr(calibration.scanner, name)
         if abs(a - b) > 1e-6 * abs(b) and not (name == "p_u" and "pitch_ratio" in calibration.tangent):
-            raise InputError(f"the scene's detector has {name} = {a:g}, the calibration's {b:g}; simulate the "
-                             "detector that was calibrated (scanner.binning reads it out in blocks)")
+            raise InputError(
+                f"the scene's detector has {name} = {a:g}, the calibration's {b:g}; simulate the "
+                "detector that was calibrated (scanner.binning reads it out in blocks)"
+            )
 
 
 def _drawn_poses(run: SimulatedRun, calibration: Calibration, delta: Array) -> RigidTransform:
@@ -221,7 +241,14 @@ def _summary(rows: list[MeasurementResult], truth: float | None, seed: int, cali
     errors = values - (values.mean() if truth is None else truth)
     low, high = shortest_interval(errors)
     return Simulated(
-        mean=math.nan if truth is None else float(errors.mean()), u=float(errors.std(ddof=1)), low=low, high=high,
-        runs=len(errors), stable=False, seed=seed, u_fit=float(np.sqrt(np.mean([r.u**2 for r in rows]))),
-        dof_fit=float(np.sum([r.dof for r in rows])), with_calibration=calibrated,
+        mean=math.nan if truth is None else float(errors.mean()),
+        u=float(errors.std(ddof=1)),
+        low=low,
+        high=high,
+        runs=len(errors),
+        stable=False,
+        seed=seed,
+        u_fit=float(np.sqrt(np.mean([r.u**2 for r in rows]))),
+        dof_fit=float(np.sum([r.dof for r in rows])),
+        with_calibration=calibrated,
     )

@@ -63,7 +63,8 @@ def calibrate_inverse(
         if name == "d_SR" or name.startswith("axis"):
             raise NotObservableError(
                 f"{name} says only where W begins on a scanner that moves as a whole; no image depends on it beside "
-                "the mount", direction=name,
+                "the mount",
+                direction=name,
             )
     machine = machine_of(manipulator)
     if distances and (model == "rigid" or (model == "auto" and machine is None)):
@@ -77,9 +78,14 @@ def calibrate_inverse(
         raise
     if machine is not None or d_SD_sigma or model not in ("auto", "rigid"):
         found = calibrate_kinematic(
-            scanner, turned, observations, rigid=found,
+            scanner,
+            turned,
+            observations,
+            rigid=found,
             manipulator=None if machine is None else InverseManipulator(machine=machine),
-            model="rigid" if machine is None and model == "auto" else model, distances=distances, inverse=True,
+            model="rigid" if machine is None and model == "auto" else model,
+            distances=distances,
+            inverse=True,
             view_sigma={"d_SD": d_SD_sigma} if d_SD_sigma else None,
         )
     block = {**found.manipulator, "arrangement": MOVING_SCANNER}

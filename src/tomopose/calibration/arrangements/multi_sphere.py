@@ -66,7 +66,8 @@ def pose_from_balls(
     spread = np.linalg.svd(balls - balls.mean(axis=0), compute_uv=False)
     if spread[1] < 1e-6 * spread[0]:
         raise NotObservableError(
-            "the balls stand in a line: a turn about it moves none of them", direction="turn about the balls' line",
+            "the balls stand in a line: a turn about it moves none of them",
+            direction="turn about the balls' line",
             singular_values=spread.tolist(),
         )
     C = np.tile(np.eye(2), (m, 1, 1)) if covariance is None else np.asarray(covariance, dtype=np.float64)
@@ -164,9 +165,7 @@ def poses_of_views(
         try:
             pose = pose_from_balls(scanner, x[seen], balls[seen], covariance=C, start=start)
             if pose.chi2 > 10.0 * (2 * seen.sum()) and start is not None:
-                pose = min(
-                    pose, pose_from_balls(scanner, x[seen], balls[seen], covariance=C), key=lambda q: q.chi2
-                )
+                pose = min(pose, pose_from_balls(scanner, x[seen], balls[seen], covariance=C), key=lambda q: q.chi2)
         except NotConvergedError:
             pose = pose_from_balls(scanner, x[seen], balls[seen], covariance=C)
         found.append(pose)

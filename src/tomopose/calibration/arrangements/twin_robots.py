@@ -118,7 +118,11 @@ def calibrate_twin(
         if name == "kinematic" and model == "rigid":
             continue
         problem = KinematicProblem(
-            data=data, poses=rows, free=freed, model=machines, repeatability=machines.repeatability,
+            data=data,
+            poses=rows,
+            free=freed,
+            model=machines,
+            repeatability=machines.repeatability,
             bars=known_bars(distances, data),
         )
         begin = replace(start, p=np.concatenate([np.zeros(len(machines.names) - 9), start.p]))
@@ -168,7 +172,12 @@ def _twin_of(calibration: Calibration, source_poses: PoseSequence) -> tuple[Twin
 
 
 def twin_matrices(
-    calibration: Calibration, poses: PoseSequence, source_poses: PoseSequence, *, points: Any = None, binning: int = 1,
+    calibration: Calibration,
+    poses: PoseSequence,
+    source_poses: PoseSequence,
+    *,
+    points: Any = None,
+    binning: int = 1,
     scanner: Scanner | None = None,
 ) -> ProjectionMatrices:
     """The matrices of a scan by twin robots: points of W, as it stands in the first view, to pixels.
@@ -191,8 +200,14 @@ def twin_matrices(
     x_W = field_of_view_points(own) if points is None else np.asarray(points, dtype=np.float64)
     sigma, shared = _sigma(calibration, twin, p, turned, home.inv.apply(x_W))
     matrices = ProjectionMatrices(
-        P=P @ home.inv.matrix, n_u=own.n_u, n_v=own.n_v, p_u=own.p_u, p_v=own.p_v,
-        pose_id=poses.pose_id, points_sigma=sigma, points_sigma_shared=shared,
+        P=P @ home.inv.matrix,
+        n_u=own.n_u,
+        n_v=own.n_v,
+        p_u=own.p_u,
+        p_v=own.p_v,
+        pose_id=poses.pose_id,
+        points_sigma=sigma,
+        points_sigma_shared=shared,
         in_front=home.apply(np.mean(list(calibration.balls.values()), axis=0)),
     )
     return matrices if binning == 1 else matrices.binned(binning)
@@ -214,8 +229,13 @@ def view_geometry(
     twin, p = _twin_of(calibration, source_poses)
     P = twin_view_matrices(calibration.scanner, twin, T_HT=calibration.T_HT, poses=inverse_poses(poses), p=p)
     own = ProjectionMatrices(
-        P=P, n_u=calibration.scanner.n_u, n_v=calibration.scanner.n_v, p_u=calibration.scanner.p_u,
-        p_v=calibration.scanner.p_v, pose_id=poses.pose_id, in_front=calibration.t,
+        P=P,
+        n_u=calibration.scanner.n_u,
+        n_v=calibration.scanner.n_v,
+        p_u=calibration.scanner.p_u,
+        p_v=calibration.scanner.p_v,
+        pose_id=poses.pose_id,
+        in_front=calibration.t,
     ).decompose()
     return own.d_SD, own.u_0, own.v_0
 
@@ -232,13 +252,14 @@ def _sigma(
     scanner = calibration.scanner
     data = pair(scanner, poses, none)
     problem = KinematicProblem(
-        data=data, poses=poses, free=panel_parameters(scanner, free=names), model=twin,
+        data=data,
+        poses=poses,
+        free=panel_parameters(scanner, free=names),
+        model=twin,
         repeatability=twin.repeatability,
     )
     for x in x_M:
-        state = State(
-            T_HT=calibration.T_HT, balls=np.tile(x, (len(data.ball_ids), 1)), delta=np.zeros(len(names)), p=p
-        )
+        state = State(T_HT=calibration.T_HT, balls=np.tile(x, (len(data.ball_ids), 1)), delta=np.zeros(len(names)), p=p)
         at = linearise(problem, state)
         own = 6 + 3 * len(data.ball_ids)
         J.append(np.concatenate([at.J[:, :, :6], at.J[:, :, own:]], axis=2))

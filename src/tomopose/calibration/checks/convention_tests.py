@@ -69,9 +69,17 @@ class Hypothesis:
 
     def to_json(self) -> dict[str, Any]:
         return {
-            "name": self.name, "words": self.words, "cure": self.cure, "d_rms_px": self.d_rms, "chi2": self.chi2,
-            "dof": self.dof, "delta_chi2": self.delta, "factor": self.factor, "outcome": self.outcome,
-            "verdict": WORDS[self.outcome], "symmetry": self.symmetry,
+            "name": self.name,
+            "words": self.words,
+            "cure": self.cure,
+            "d_rms_px": self.d_rms,
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "delta_chi2": self.delta,
+            "factor": self.factor,
+            "outcome": self.outcome,
+            "verdict": WORDS[self.outcome],
+            "symmetry": self.symmetry,
         }
 
 
@@ -125,16 +133,17 @@ def _rms(problem: Problem, fit: Fit, free: FreeParameters) -> float:
     return float(np.sqrt((r**2).sum(axis=1).mean()))
 
 
-def _fit_rival(problem: Problem, rays: Rays, free: FreeParameters, held: FreeParameters,
-               starts: int) -> Fit:
+def _fit_rival(problem: Problem, rays: Rays, free: FreeParameters, held: FreeParameters, starts: int) -> Fit:
     start = closed_form(problem, rays)
     fit = minimise(problem, held, start, iterations=RIVAL_ITERATIONS)
     if not np.isfinite(fit.chi2):
         fit = minimise(problem, held, turned_about_beam(problem, start[0], rays), iterations=RIVAL_ITERATIONS)
     if not np.isfinite(fit.chi2):
         # mirrored data have no closed form in front of the source; the residual they leave is still worth knowing
-        others = (minimise(problem, held, start, iterations=RIVAL_ITERATIONS)
-                  for start in itertools.islice(other_starts(problem, rays), starts))
+        others = (
+            minimise(problem, held, start, iterations=RIVAL_ITERATIONS)
+            for start in itertools.islice(other_starts(problem, rays), starts)
+        )
         fit = minimise(problem, held, min((fit, *others), key=lambda one: one.chi2))
     return minimise(problem, free, fit, iterations=RIVAL_ITERATIONS) if len(free) else fit
 
@@ -154,8 +163,15 @@ def ranked(
     dof = 2 * len(problem) + n_prior - m
     found = [
         Hypothesis(
-            name="declared", words="the data as declared", cure="", d_rms=_rms(problem, fit, free), chi2=fit.chi2,
-            dof=dof, delta=0.0, factor=1.0, outcome="declared",
+            name="declared",
+            words="the data as declared",
+            cure="",
+            d_rms=_rms(problem, fit, free),
+            chi2=fit.chi2,
+            dof=dof,
+            delta=0.0,
+            factor=1.0,
+            outcome="declared",
         )
     ]
     for rival in rivals:
@@ -175,8 +191,13 @@ def ranked(
             if moved:
                 # under the rival, too, something moved: let both follow it, or a drift would pass for a convention
                 still = _judged(
-                    rival, changed, replace(other, chi2=chi2_with_movements(changed, free, other, moved)), free,
-                    chi2_with_movements(problem, free, fit, moved), dof, dof_r,
+                    rival,
+                    changed,
+                    replace(other, chi2=chi2_with_movements(changed, free, other, moved)),
+                    free,
+                    chi2_with_movements(problem, free, fit, moved),
+                    dof,
+                    dof_r,
                 )
                 judged = judged if still.outcome == "better" else replace(still, chi2=other.chi2)
         found.append(judged)
@@ -188,16 +209,25 @@ def _rank(h: Hypothesis) -> tuple[int, float]:
     return {"better": 0, "declared": 1}.get(h.outcome, 2), h.delta
 
 
-def _judged(rival: Rival, changed: Problem, other: Fit, free: FreeParameters, chi2: float, dof: int,
-            dof_r: int) -> Hypothesis:
+def _judged(
+    rival: Rival, changed: Problem, other: Fit, free: FreeParameters, chi2: float, dof: int, dof_r: int
+) -> Hypothesis:
     chi2_r = other.chi2 * dof / dof_r
     delta = (chi2_r - chi2) / max(1.0, min(chi2, chi2_r) / dof)
     factor = max(chi2, dof) / max(chi2_r, dof)
     believable = chi2_r < GOOD_CHI2 * dof or factor > CLEARLY
     outcome = "better" if delta < -BETTER and believable else "same" if delta < SAME else "worse"
     return Hypothesis(
-        name=rival.name, words=rival.words, cure=rival.cure, d_rms=_rms(changed, other, free), chi2=other.chi2,
-        dof=dof_r, delta=float(delta), factor=float(factor), outcome=outcome, symmetry=rival.symmetry,
+        name=rival.name,
+        words=rival.words,
+        cure=rival.cure,
+        d_rms=_rms(changed, other, free),
+        chi2=other.chi2,
+        dof=dof_r,
+        delta=float(delta),
+        factor=float(factor),
+        outcome=outcome,
+        symmetry=rival.symmetry,
     )
 
 
@@ -214,8 +244,11 @@ def set_pose_rival(problem: Problem, poses: PoseSequence | Iterable[PoseSequence
         return replace(p, R_MH=R, t_MH=t)
 
     return Rival(
-        name="set poses", words="the images were taken at the set poses, not at the encoder's",
-        cure="poses.csv: # source: set", change=change, quick=True,
+        name="set poses",
+        words="the images were taken at the set poses, not at the encoder's",
+        cure="poses.csv: # source: set",
+        change=change,
+        quick=True,
     )
 
 
@@ -228,8 +261,10 @@ def diagnose(
 
     Raises InputError where observations and poses do not pair.
     """
-    given = (value if isinstance(value, (Scanner, PoseSequence, BallObservations)) else list(value)
-             for value in (scanner, poses, observations))
+    given = (
+        value if isinstance(value, (Scanner, PoseSequence, BallObservations)) else list(value)
+        for value in (scanner, poses, observations)
+    )
     scanner_, poses_, observations_ = given
     problem = pair(scanner_, poses_, observations_)  # type: ignore[arg-type]
     free = free_parameters(problem.scanners)

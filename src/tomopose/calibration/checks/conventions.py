@@ -167,86 +167,190 @@ def _order_cure(order: str) -> str:
 
 def _list() -> tuple[Rival, ...]:
     image = [
-        Rival(name="rows flipped", words="image rows run the other way", cure=_ROWS,
-              change=_image(((1, 0), (0, -1))), quick=True),
-        Rival(name="columns flipped", words="image columns run the other way",
-              cure="mirror the images left to right (the detector is read from behind)",
-              change=_image(((-1, 0), (0, 1))), quick=True),
-        Rival(name="image turned by 180 degrees", words="rows and columns run the other way",
-              cure=f"{_ROWS} and mirror left to right", change=_image(((-1, 0), (0, -1))), quick=True),
-        Rival(name="image transposed", words="rows and columns are exchanged",
-              cure="transpose the images (axis order [v, u])", change=_image(((0, 1), (1, 0)))),
-        Rival(name="image turned by 90 degrees", words="the image is turned by a quarter turn",
-              cure="turn the images by 90 degrees", change=_image(((0, -1), (1, 0)))),
-        Rival(name="image turned by 270 degrees", words="the image is turned by three quarter turns",
-              cure="turn the images by 270 degrees", change=_image(((0, 1), (-1, 0)))),
-        Rival(name="image transposed and turned by 180 degrees", words="rows and columns exchanged and reversed",
-              cure="transpose and turn the images", change=_image(((0, -1), (-1, 0)))),
+        Rival(
+            name="rows flipped",
+            words="image rows run the other way",
+            cure=_ROWS,
+            change=_image(((1, 0), (0, -1))),
+            quick=True,
+        ),
+        Rival(
+            name="columns flipped",
+            words="image columns run the other way",
+            cure="mirror the images left to right (the detector is read from behind)",
+            change=_image(((-1, 0), (0, 1))),
+            quick=True,
+        ),
+        Rival(
+            name="image turned by 180 degrees",
+            words="rows and columns run the other way",
+            cure=f"{_ROWS} and mirror left to right",
+            change=_image(((-1, 0), (0, -1))),
+            quick=True,
+        ),
+        Rival(
+            name="image transposed",
+            words="rows and columns are exchanged",
+            cure="transpose the images (axis order [v, u])",
+            change=_image(((0, 1), (1, 0))),
+        ),
+        Rival(
+            name="image turned by 90 degrees",
+            words="the image is turned by a quarter turn",
+            cure="turn the images by 90 degrees",
+            change=_image(((0, -1), (1, 0))),
+        ),
+        Rival(
+            name="image turned by 270 degrees",
+            words="the image is turned by three quarter turns",
+            cure="turn the images by 270 degrees",
+            change=_image(((0, 1), (-1, 0))),
+        ),
+        Rival(
+            name="image transposed and turned by 180 degrees",
+            words="rows and columns exchanged and reversed",
+            cure="transpose and turn the images",
+            change=_image(((0, -1), (-1, 0))),
+        ),
     ]
     table = [
-        Rival(name="table sign", words="the table turns the other way", cure=_POSES + "the sign of alpha_deg",
-              change=_alpha(-1, 0.0), quick=True),
-        Rival(name="image turned by 180 degrees and table sign",
-              words="the scanner stands upside down: images turned about the beam and the table turning the other way",
-              cure="check one labelled fact, such as an image before and after a move in +z",
-              change=_upside_down, symmetry=True),
-        Rival(name="table zero", words="the table's zero lies elsewhere (5 degrees tried)",
-              cure="none needed while the scan uses the same zero", change=_alpha(1, TABLE_OFFSET), symmetry=True),
+        Rival(
+            name="table sign",
+            words="the table turns the other way",
+            cure=_POSES + "the sign of alpha_deg",
+            change=_alpha(-1, 0.0),
+            quick=True,
+        ),
+        Rival(
+            name="image turned by 180 degrees and table sign",
+            words="the scanner stands upside down: images turned about the beam and the table turning the other way",
+            cure="check one labelled fact, such as an image before and after a move in +z",
+            change=_upside_down,
+            symmetry=True,
+        ),
+        Rival(
+            name="table zero",
+            words="the table's zero lies elsewhere (5 degrees tried)",
+            cure="none needed while the scan uses the same zero",
+            change=_alpha(1, TABLE_OFFSET),
+            symmetry=True,
+        ),
     ]
     axis = "UVW"
     signs = []
     for s in ((-1, 1, 1), (1, -1, 1), (1, 1, -1), (-1, -1, 1), (-1, 1, -1), (1, -1, -1), (-1, -1, -1)):
         turned = "".join(a for a, one in zip(axis, s, strict=True) if one < 0)
         signs.append(
-            Rival(name=f"sign of {turned}", words=f"rotation {' and '.join(turned)} counted the other way",
-                  cure=_POSES + f"the sign of the angle columns {', '.join(turned)}", change=_signs(s),
-                  quick=len(turned) in (1, 3))
+            Rival(
+                name=f"sign of {turned}",
+                words=f"rotation {' and '.join(turned)} counted the other way",
+                cure=_POSES + f"the sign of the angle columns {', '.join(turned)}",
+                change=_signs(s),
+                quick=len(turned) in (1, 3),
+            )
         )
     orders = [
-        Rival(name=f"order {o}", words=f"the angles are those of {_product(o)}", cure=_POSES + _order_cure(o),
-              change=_order(o), quick=o in ("ZYX", "XYZ"))
+        Rival(
+            name=f"order {o}",
+            words=f"the angles are those of {_product(o)}",
+            cure=_POSES + _order_cure(o),
+            change=_order(o),
+            quick=o in ("ZYX", "XYZ"),
+        )
         for o in EULER_ORDERS
     ]
     frames = [
-        Rival(name="pose inverted", words="the poses map base to plate, or it is the scanner that moves",
-              cure=_POSES + "invert every pose; where the scanner moves: --arrangement moving-scanner",
-              change=_inverse, quick=True),
-        Rival(name="rotation inverted", words="only the rotations are transposed",
-              cure=_POSES + "transpose every rotation", change=_inverse_rotation, quick=True),
-        Rival(name="translation in the tool frame", words="translations run along the moved axes",
-              cure=_POSES + "turn the translations by the pose's rotation", change=_tool_translation, quick=True),
-        Rival(name="translation turned back", words="translations were written along fixed axes after turning",
-              cure=_POSES + "turn the translations back by the pose's rotation", change=_base_translation),
+        Rival(
+            name="pose inverted",
+            words="the poses map base to plate, or it is the scanner that moves",
+            cure=_POSES + "invert every pose; where the scanner moves: --arrangement moving-scanner",
+            change=_inverse,
+            quick=True,
+        ),
+        Rival(
+            name="rotation inverted",
+            words="only the rotations are transposed",
+            cure=_POSES + "transpose every rotation",
+            change=_inverse_rotation,
+            quick=True,
+        ),
+        Rival(
+            name="translation in the tool frame",
+            words="translations run along the moved axes",
+            cure=_POSES + "turn the translations by the pose's rotation",
+            change=_tool_translation,
+            quick=True,
+        ),
+        Rival(
+            name="translation turned back",
+            words="translations were written along fixed axes after turning",
+            cure=_POSES + "turn the translations back by the pose's rotation",
+            change=_base_translation,
+        ),
     ]
     swaps = [
-        Rival(name=f"{a} and {b} exchanged", words=f"the translation columns {a} and {b} are exchanged",
-              cure=_POSES + f"exchange the columns {a}_mm and {b}_mm", change=_axes_signs(M))
-        for a, b, M in (("x", "y", [[0, 1, 0], [1, 0, 0], [0, 0, 1]]), ("y", "z", [[1, 0, 0], [0, 0, 1], [0, 1, 0]]),
-                        ("x", "z", [[0, 0, 1], [0, 1, 0], [1, 0, 0]]))
+        Rival(
+            name=f"{a} and {b} exchanged",
+            words=f"the translation columns {a} and {b} are exchanged",
+            cure=_POSES + f"exchange the columns {a}_mm and {b}_mm",
+            change=_axes_signs(M),
+        )
+        for a, b, M in (
+            ("x", "y", [[0, 1, 0], [1, 0, 0], [0, 0, 1]]),
+            ("y", "z", [[1, 0, 0], [0, 0, 1], [0, 1, 0]]),
+            ("x", "z", [[0, 0, 1], [0, 1, 0], [1, 0, 0]]),
+        )
     ]
     senses = [
-        Rival(name=f"sign of {''.join(n)}", words=f"translation {' and '.join(n)} counted the other way",
-              cure=_POSES + "the sign of " + ", ".join(f"{c}_mm" for c in n),
-              change=_axes_signs(np.diag([-1.0 if c in n else 1.0 for c in "xyz"])))
+        Rival(
+            name=f"sign of {''.join(n)}",
+            words=f"translation {' and '.join(n)} counted the other way",
+            cure=_POSES + "the sign of " + ", ".join(f"{c}_mm" for c in n),
+            change=_axes_signs(np.diag([-1.0 if c in n else 1.0 for c in "xyz"])),
+        )
         for n in ("x", "y", "z", "xyz")
     ]
     lags = [
-        Rival(name=f"pairing lag {lag:+d}", words=f"each image belongs to the pose {abs(lag)} "
-              f"{'later' if lag > 0 else 'earlier'}", cure="pair images and poses by name (column image or pose_id)",
-              change=_lag(lag), quick=abs(lag) == 1)
+        Rival(
+            name=f"pairing lag {lag:+d}",
+            words=f"each image belongs to the pose {abs(lag)} {'later' if lag > 0 else 'earlier'}",
+            cure="pair images and poses by name (column image or pose_id)",
+            change=_lag(lag),
+            quick=abs(lag) == 1,
+        )
         for lag in (-3, -2, -1, 1, 2, 3)
     ]
     units = [
-        Rival(name="angles are radians", words="the angles read as degrees are radians",
-              cure=_POSES + "convert the angles to degrees", change=_angle_factor(180.0 / np.pi)),
-        Rival(name="angles are degrees", words="the angles read as radians are degrees",
-              cure=_POSES + "convert the angles to radians", change=_angle_factor(np.pi / 180.0)),
-        Rival(name="half a pixel low", words="(0, 0) is a pixel's corner: u and v are half a pixel too high",
-              cure="observations.csv: subtract 0.5 px from u_px and v_px", change=_shift(-0.5, -0.5)),
-        Rival(name="half a pixel high", words="u and v are half a pixel too low",
-              cure="observations.csv: add 0.5 px to u_px and v_px", change=_shift(0.5, 0.5)),
-        Rival(name="pixels counted from 1", words="pixels are counted from 1",
-              cure="observations.csv: subtract 1 px from u_px and v_px", change=_shift(-1.0, -1.0)),
+        Rival(
+            name="angles are radians",
+            words="the angles read as degrees are radians",
+            cure=_POSES + "convert the angles to degrees",
+            change=_angle_factor(180.0 / np.pi),
+        ),
+        Rival(
+            name="angles are degrees",
+            words="the angles read as radians are degrees",
+            cure=_POSES + "convert the angles to radians",
+            change=_angle_factor(np.pi / 180.0),
+        ),
+        Rival(
+            name="half a pixel low",
+            words="(0, 0) is a pixel's corner: u and v are half a pixel too high",
+            cure="observations.csv: subtract 0.5 px from u_px and v_px",
+            change=_shift(-0.5, -0.5),
+        ),
+        Rival(
+            name="half a pixel high",
+            words="u and v are half a pixel too low",
+            cure="observations.csv: add 0.5 px to u_px and v_px",
+            change=_shift(0.5, 0.5),
+        ),
+        Rival(
+            name="pixels counted from 1",
+            words="pixels are counted from 1",
+            cure="observations.csv: subtract 1 px from u_px and v_px",
+            change=_shift(-1.0, -1.0),
+        ),
     ]
     return (*image, *table, *signs, *orders, *frames, *swaps, *senses, *lags, *units)
 
@@ -262,7 +366,9 @@ def _over_inverse(rival: Rival) -> Rival:
     if rival.name != "pose inverted":
         return replace(rival, change=change)
     return replace(
-        rival, change=change, words="the object moves and the scanner stands still, or the poses map base to plate",
+        rival,
+        change=change,
+        words="the object moves and the scanner stands still, or the poses map base to plate",
         cure="leave out --arrangement moving-scanner, or poses.csv: invert every pose",
     )
 

@@ -48,7 +48,11 @@ class Effect:
 
     def to_json(self) -> dict[str, Any]:
         return {
-            "name": self.name, "p": self.p, "size_px": self.size_px, "share": self.share, "words": self.words,
+            "name": self.name,
+            "p": self.p,
+            "size_px": self.size_px,
+            "share": self.share,
+            "words": self.words,
             "at": self.at,
         }
 
@@ -71,8 +75,11 @@ class Integrity:
 
     def to_json(self) -> dict[str, Any]:
         return {
-            "effects": [e.to_json() for e in self.effects], "repeats": list(self.repeats),
-            "held_out_rms_px": self.held_out_rms, "held_out_chi2": self.held_out_chi2, "fit_rms_px": self.fit_rms,
+            "effects": [e.to_json() for e in self.effects],
+            "repeats": list(self.repeats),
+            "held_out_rms_px": self.held_out_rms,
+            "held_out_chi2": self.held_out_chi2,
+            "fit_rms_px": self.fit_rms,
         }
 
 
@@ -94,8 +101,9 @@ def _without(C: Array, A: Array) -> Array:
     return np.asarray(C - A @ np.linalg.lstsq(A, C, rcond=1e-10)[0], dtype=np.float64)
 
 
-def drift(problem: Problem, Jw: Array, rw: Array, columns: Array, *, name: str, words: str,
-          unit: tuple[float, str]) -> Effect:
+def drift(
+    problem: Problem, Jw: Array, rw: Array, columns: Array, *, name: str, words: str, unit: tuple[float, str]
+) -> Effect:
     """A slow change of the coordinates behind `columns` (n, 2, c), whitened derivatives: cubic in time, about a
     constant that is free.
 
@@ -117,7 +125,9 @@ def drift(problem: Problem, Jw: Array, rw: Array, columns: Array, *, name: str, 
     size = _size_px(problem, (C @ move).reshape(-1, 2))
     factor, symbol = unit
     return Effect(
-        name=name, p=_p(gain, C.shape[1], left, rw.size - known.shape[1] - C.shape[1]), size_px=size,
+        name=name,
+        p=_p(gain, C.shape[1], left, rw.size - known.shape[1] - C.shape[1]),
+        size_px=size,
         share=gain / max(before, 1e-300),
         words=f"{words.format(f'{reach * factor:.2g} {symbol}')} over the run, {size:.2g} px rms",
     )
@@ -171,8 +181,12 @@ def change_point(problem: Problem, Jw: Array, rw: Array, columns: Array, *, name
     best = float(gain.max())
     p = _p(best, c, float((rw**2).sum()) - best, rw.size - Jw.shape[2] - c)
     return Effect(
-        name=name, p=min(1.0, p * len(places)), size_px=size, share=_share(best, rw),
-        words=f"{words} at pose {problem.pose_id[k]}: {size:.2g} px rms", at=problem.pose_id[k],
+        name=name,
+        p=min(1.0, p * len(places)),
+        size_px=size,
+        share=_share(best, rw),
+        words=f"{words} at pose {problem.pose_id[k]}: {size:.2g} px rms",
+        at=problem.pose_id[k],
     )
 
 
@@ -181,21 +195,28 @@ def repeats(problem: Problem, scale: float) -> tuple[dict[str, Any], ...]:
     same = (
         (np.linalg.norm(problem.t_MH - problem.t_MH[0], axis=1) < REPEATED_MM)
         & (rotation_angle_between(problem.R_MH[0], problem.R_MH) < REPEATED_RAD)
-        & (problem.alpha == problem.alpha[0]) & (problem.ball == problem.ball[0]) & (problem.run == problem.run[0])
+        & (problem.alpha == problem.alpha[0])
+        & (problem.ball == problem.ball[0])
+        & (problem.run == problem.run[0])
     )
     result = []
     for k in np.flatnonzero(same)[1:]:
         dx = problem.x_D[k] - problem.x_D[0]
         V = (problem.covariance[k] + problem.covariance[0]) * scale
-        result.append({
-            "first": problem.pose_id[0], "again": problem.pose_id[k], "distance_px": float(np.linalg.norm(dx)),
-            "sigmas": float(np.sqrt(dx @ np.linalg.solve(V, dx))),
-        })
+        result.append(
+            {
+                "first": problem.pose_id[0],
+                "again": problem.pose_id[k],
+                "distance_px": float(np.linalg.norm(dx)),
+                "sigmas": float(np.sqrt(dx @ np.linalg.solve(V, dx))),
+            }
+        )
     return tuple(result)
 
 
-def blocked_cross_validation(problem: Problem, free: FreeParameters, fit: Fit,
-                             blocks_: int = BLOCKS) -> tuple[float, float]:
+def blocked_cross_validation(
+    problem: Problem, free: FreeParameters, fit: Fit, blocks_: int = BLOCKS
+) -> tuple[float, float]:
     """(rms px, mean squared error in predicted standard deviations) of poses predicted by a fit without their block.
 
     The blocks are runs of neighbours in the sequence: what drifts or was set together is left out together.  nan where
@@ -226,13 +247,20 @@ def movements(problem: Problem, free: FreeParameters, fit: Fit) -> tuple[Effect,
     J, r = jacobian(problem, free, b), problem.x_D - b.x_D
     Jw, rw = problem.W @ J, (problem.W @ r[:, :, None])[..., 0]
     found = [
-        drift(problem, Jw, rw, problem.W @ b.J_t_HT, name="drift", words="the ball drifts by {}",
-              unit=(1000.0, "um")),
-        drift(problem, Jw, rw, problem.W, name="image drift",
-              words="the images drift by {} (focal spot or detector)", unit=(1.0, "px")),
+        drift(problem, Jw, rw, problem.W @ b.J_t_HT, name="drift", words="the ball drifts by {}", unit=(1000.0, "um")),
+        drift(
+            problem,
+            Jw,
+            rw,
+            problem.W,
+            name="image drift",
+            words="the images drift by {} (focal spot or detector)",
+            unit=(1.0, "px"),
+        ),
         change_point(problem, Jw, rw, problem.W @ b.J_t, name="ball", words="the ball changed its place"),
-        change_point(problem, Jw, rw, problem.W @ b.J_mount, name="mount",
-                     words="the mount changed (bumped or referenced anew)"),
+        change_point(
+            problem, Jw, rw, problem.W @ b.J_mount, name="mount", words="the mount changed (bumped or referenced anew)"
+        ),
     ]
     return tuple(e for e in found if e is not None)
 

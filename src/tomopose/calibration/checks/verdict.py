@@ -90,16 +90,15 @@ def verdict(f: Findings) -> tuple[str, tuple[str, ...]]:
     if f.integrity:
         # residuals that come from the poses are not white: there, chance alone explains what looks significant
         least = EFFECT_SHARE if f.chi2_dof > MISFIT_CHI2 else 0.0
-        moved = [
-            e for e in f.integrity.effects if e.p < SIGNIFICANT and e.size_px > EFFECT_PX and e.share > least
-        ]
+        moved = [e for e in f.integrity.effects if e.p < SIGNIFICANT and e.size_px > EFFECT_PX and e.share > least]
         # drifts resemble one another, and so do steps: the likeliest of each is named
         for kind in ([e for e in moved if not e.at], [e for e in moved if e.at]):
             doubtful += [f"{e.words} (p = {e.p:.1g})" for e in sorted(kind, key=lambda e: (e.p, -e.share))[:1]]
         doubtful += [
             f"pose {r['first']} taken again as {r['again']} is off by {r['distance_px']:.3g} px "
             f"({r['sigmas']:.1f} sigma)"
-            for r in f.integrity.repeats if r["sigmas"] > REPEAT_SIGMAS and r["distance_px"] > REPEAT_PX
+            for r in f.integrity.repeats
+            if r["sigmas"] > REPEAT_SIGMAS and r["distance_px"] > REPEAT_PX
         ]
         held = f.integrity
         if held.held_out_rms > HELD_OUT_FACTOR * held.fit_rms and held.held_out_chi2 > HELD_OUT_CHI2 * max(

@@ -45,7 +45,6 @@ from tomopose.units import Array
 MODELS = ("auto", "rigid", "kinematic", "slack")
 
 
-
 def calibrate_kinematic(
     scanner: Scanner | Sequence[Scanner],
     poses: PoseSequence | Sequence[PoseSequence],
@@ -187,7 +186,10 @@ def known_bars(
 
 
 def _fit_all(
-    problem: KinematicProblem, start: State, candidates: Sequence[tuple[str, ErrorModel | None]], robust: bool,
+    problem: KinematicProblem,
+    start: State,
+    candidates: Sequence[tuple[str, ErrorModel | None]],
+    robust: bool,
     needed: str,
 ) -> dict[str, ModelFit]:
     """The candidates' fits, simplest first, all on the rows that belong for the richest: evidence compares only so.

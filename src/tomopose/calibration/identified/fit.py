@@ -142,9 +142,7 @@ def with_size(estimate: MapEstimate) -> tuple[MapEstimate, float]:
     return (now, float(sizes.max())) if taken else (estimate, 1.0)
 
 
-def fit_model(
-    problem: KinematicProblem, start: State, *, robust: bool = True, keep: Any = None
-) -> ModelFit:
+def fit_model(problem: KinematicProblem, start: State, *, robust: bool = True, keep: Any = None) -> ModelFit:
     """The optimum of a model from a start, with scatter and size from the data.
 
     keep: (n,) rows to use; without it those that belong are found (robust) or all are used.

@@ -36,18 +36,21 @@ def believed(model: ErrorModel | None, share: float) -> ErrorModel | None:
         inner = believed(model.machine, share)
         return None if inner is None else replace(model, machine=inner)
     if isinstance(model, Hexapod) and (model.scale_sigma or model.geometry_sigma):
-        return replace(
-            model, scale_sigma=share * model.scale_sigma, geometry_sigma=share * model.geometry_sigma
-        )
+        return replace(model, scale_sigma=share * model.scale_sigma, geometry_sigma=share * model.geometry_sigma)
     return None
 
 
 def _step(origin: State, state: State) -> Array:
     """(m,): what moves `origin` to `state`, as in `State.moved`."""
-    return np.concatenate([
-        log_rotation(state.T_HT.R @ origin.T_HT.R.T), state.T_HT.t - origin.T_HT.t,
-        (state.balls - origin.balls).ravel(), state.delta - origin.delta, state.p - origin.p,
-    ])
+    return np.concatenate(
+        [
+            log_rotation(state.T_HT.R @ origin.T_HT.R.T),
+            state.T_HT.t - origin.T_HT.t,
+            (state.balls - origin.balls).ravel(),
+            state.delta - origin.delta,
+            state.p - origin.p,
+        ]
+    )
 
 
 def averaged(fit: ModelFit) -> ModelFit:

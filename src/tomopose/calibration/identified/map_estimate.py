@@ -142,8 +142,13 @@ def linearise(problem: KinematicProblem, state: State) -> Linearised:
         T_MH, J_errors = real.T_MH, real.J
     scale = translation_scale(free, state.delta)
     blocks = projection_blocks(
-        adjusted_scanners(data.scanners, free, state.delta), T_HT=state.T_HT, T_MH=T_MH, t=state.balls[data.ball],
-        alpha=data.alpha, translation_scale=scale, run=data.run,
+        adjusted_scanners(data.scanners, free, state.delta),
+        T_HT=state.T_HT,
+        T_MH=T_MH,
+        t=state.balls[data.ball],
+        alpha=data.alpha,
+        translation_scale=scale,
+        run=data.run,
     )
     J_pose = np.concatenate([-blocks.G_H @ skew(blocks.x_H - scale * T_MH.t), scale * blocks.G_H], axis=2)
     J_balls = np.zeros((n, 2, nb, 3))

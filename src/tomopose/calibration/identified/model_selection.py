@@ -49,9 +49,14 @@ class Judgement:
 
     def to_json(self) -> dict[str, Any]:
         return {
-            "model": self.model, "log_evidence": self.log_evidence, "log_predictive": self.log_predictive,
-            "cv_rms_px": self.cv_rms, "cv_chi2": self.cv_chi2,
-            "d_rms_px": self.d_rms, "chi2_dof": self.chi2_dof, "scatter": self.scatter,
+            "model": self.model,
+            "log_evidence": self.log_evidence,
+            "log_predictive": self.log_predictive,
+            "cv_rms_px": self.cv_rms,
+            "cv_chi2": self.cv_chi2,
+            "d_rms_px": self.d_rms,
+            "chi2_dof": self.chi2_dof,
+            "scatter": self.scatter,
             "size": self.size,
         }
 

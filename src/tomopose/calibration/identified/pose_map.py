@@ -33,7 +33,7 @@ def map_candidates(problem: KinematicProblem, start: State) -> list[tuple[str, P
     """Maps of order 1 and 2, scaled to the poses' range, their size guessed from what the rigid model leaves."""
     scanner = problem.data.scanner
     pitch = np.sqrt(scanner.p_u * scanner.p_v) / scanner.magnification
-    left = max(float(np.sqrt(np.median(np.sum(linearise(problem, start).r**2, axis=1)))) * pitch, SMALLEST_ERROR_MM)
+    left = max(float(np.sqrt(np.median(np.sum(linearise(problem, start).r ** 2, axis=1)))) * pitch, SMALLEST_ERROR_MM)
     t, w = problem.poses.T_MH.t, log_rotation(problem.poses.T_MH.R)
     t_scale, w_scale = float(np.abs(t).max()) or 1.0, float(np.abs(w).max()) or 1e-2
     terms = {1: 6, 2: 27}
@@ -41,11 +41,16 @@ def map_candidates(problem: KinematicProblem, start: State) -> list[tuple[str, P
         (
             f"map-{order}",
             PoseMap(
-                order=order, t_scale=t_scale, w_scale=w_scale, t_sigma=2 * left, w_sigma=2 * left / lever_mm(),
+                order=order,
+                t_scale=t_scale,
+                w_scale=w_scale,
+                t_sigma=2 * left,
+                w_sigma=2 * left / lever_mm(),
                 repeatability=problem.repeatability,
             ),
         )
-        for order in (1, 2) if 2 * len(problem.poses) > 6 * terms[order]
+        for order in (1, 2)
+        if 2 * len(problem.poses) > 6 * terms[order]
     ]
 
 

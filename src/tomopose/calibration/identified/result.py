@@ -34,9 +34,7 @@ KNOWN_SCALE = 0.5
 """Share of its prior variance above which the common scale of a robot's links counts as not measured."""
 
 
-def comparison(
-    judged: Mapping[str, Judgement], fits: Mapping[str, ModelFit], chosen: str
-) -> dict[str, Any]:
+def comparison(judged: Mapping[str, Judgement], fits: Mapping[str, ModelFit], chosen: str) -> dict[str, Any]:
     """What the report shows: the models side by side, and their residuals by axis of rotation."""
     shown = dict.fromkeys(("rigid", chosen if chosen != "rigid" else list(fits)[-1]))
     problem = fits["rigid"].estimate.problem
@@ -61,7 +59,9 @@ def _parameters(fit: ModelFit) -> tuple[Parameter, ...]:
     values = np.concatenate([e.state.T_HT.t, e.state.balls.ravel(), free.value + e.state.delta, e.state.p])
     model = e.problem.model
     units = (
-        *("mm",) * (3 + e.state.balls.size), *(unit_of(n) for n in free.names), *(() if model is None else model.units)
+        *("mm",) * (3 + e.state.balls.size),
+        *(unit_of(n) for n in free.names),
+        *(() if model is None else model.units),
     )
     result += [
         Parameter(name=n, value=float(v), u=float(s), unit=unit)
@@ -83,8 +83,13 @@ def scatter_block(fit: ModelFit) -> dict[str, list[float]]:
 
 
 def calibration_of(
-    rigid: Calibration | None, fits: Mapping[str, ModelFit], judged: Mapping[str, Judgement], chosen: str, asked: str,
-    ids: tuple[str, ...], doubts: tuple[str, ...],
+    rigid: Calibration | None,
+    fits: Mapping[str, ModelFit],
+    judged: Mapping[str, Judgement],
+    chosen: str,
+    asked: str,
+    ids: tuple[str, ...],
+    doubts: tuple[str, ...],
 ) -> Calibration:
     fit = fits[chosen]
     e = fit.estimate
@@ -120,7 +125,8 @@ def calibration_of(
             reasons.append(sentence)
     outliers = {
         str(i): f"residual beyond what a clean run allows: {d:.1f} standard deviations"
-        for i, d, k in zip(ids, np.sqrt(fit.distance2), fit.keep, strict=True) if not k
+        for i, d, k in zip(ids, np.sqrt(fit.distance2), fit.keep, strict=True)
+        if not k
     }
     name = "slack" if asked == "slack" else chosen
     scanners = adjusted_scanners(data.scanners, problem.free, e.state.delta)

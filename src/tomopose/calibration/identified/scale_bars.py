@@ -44,9 +44,7 @@ def swapped_rows(fit: ModelFit, problem: KinematicProblem) -> list[tuple[str, in
     best = np.argmin(d2, axis=1)
     scale = max(1.0, float(np.median(own[fit.keep])) / (2 * np.log(2)))
     wrong = (best != problem.data.ball) & (own > limit(n) * scale) & (d2[np.arange(n), best] < SWAP_GAIN * own)
-    return [
-        (problem.data.pose_id[k], ids[int(problem.data.ball[k])], ids[int(best[k])]) for k in np.flatnonzero(wrong)
-    ]
+    return [(problem.data.pose_id[k], ids[int(problem.data.ball[k])], ids[int(best[k])]) for k in np.flatnonzero(wrong)]
 
 
 def require_balls_not_swapped(fit: ModelFit, problem: KinematicProblem) -> None:

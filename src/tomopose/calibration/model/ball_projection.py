@@ -25,7 +25,18 @@ from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
 
 SCANNER_COLUMNS = (
-    "d_SD", "d_SR", "p_u", "p_v", "u_0", "v_0", "eta", "theta", "phi", "axis_y", "axis_tilt_x", "axis_tilt_y",
+    "d_SD",
+    "d_SR",
+    "p_u",
+    "p_v",
+    "u_0",
+    "v_0",
+    "eta",
+    "theta",
+    "phi",
+    "axis_y",
+    "axis_tilt_x",
+    "axis_tilt_y",
     "translation_scale",
 )
 """What the projection depends on besides T_HT, T_MH, t and alpha, in the order of `ProjectionBlocks.J_scanner`.
@@ -70,8 +81,22 @@ def _table(s: Array, alpha: float, M: Array) -> None:
 
 @njit(cache=True)
 def project_pose(
-    s: Array, R_HT: Array, t_HT: Array, R_k: Array, t_k: Array, t: Array, alpha: float, derivatives: bool,
-    x: Array, x_H: Array, G_H: Array, G_T: Array, y_T: Array, J_s: Array, R: Array, M: Array,
+    s: Array,
+    R_HT: Array,
+    t_HT: Array,
+    R_k: Array,
+    t_k: Array,
+    t: Array,
+    alpha: float,
+    derivatives: bool,
+    x: Array,
+    x_H: Array,
+    G_H: Array,
+    G_T: Array,
+    y_T: Array,
+    J_s: Array,
+    R: Array,
+    M: Array,
 ) -> bool:
     """One pose.  Writes x (2,), x_H (3,), G_H = dx/dx_H and G_T = dx/dx_T (2, 3), y_T = R_HT x_H (3,), J_s (2, 13).
 
@@ -151,7 +176,14 @@ def project_pose(
 
 @njit(cache=True)
 def _project_all(
-    s: Array, run: Any, R_HT: Array, t_HT: Array, R_k: Array, t_k: Array, t: Array, alpha: Array,
+    s: Array,
+    run: Any,
+    R_HT: Array,
+    t_HT: Array,
+    R_k: Array,
+    t_k: Array,
+    t: Array,
+    alpha: Array,
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     n = R_k.shape[0]
     x, x_H, y_T = np.full((n, 2), np.nan), np.empty((n, 3)), np.empty((n, 3))
@@ -159,8 +191,22 @@ def _project_all(
     R, M = np.empty((3, 3)), np.empty((3, 3))
     for k in range(n):
         project_pose(
-            s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[k], alpha[k], True, x[k], x_H[k], G_H[k], G_T[k], y_T[k], J_s[k],
-            R, M,
+            s[run[k]],
+            R_HT,
+            t_HT,
+            R_k[k],
+            t_k[k],
+            t[k],
+            alpha[k],
+            True,
+            x[k],
+            x_H[k],
+            G_H[k],
+            G_T[k],
+            y_T[k],
+            J_s[k],
+            R,
+            M,
         )
     return x, x_H, y_T, G_H, G_T, J_s
 
@@ -229,7 +275,13 @@ def projection_blocks(
     angle = np.ascontiguousarray(np.broadcast_to(np.asarray(alpha, dtype=np.float64), (n,)))
     R_MH = np.ascontiguousarray(T_MH.R)
     x, x_H, y_T, G_H, G_T, J_s = _project_all(
-        s, index, np.ascontiguousarray(T_HT.R), np.ascontiguousarray(T_HT.t), R_MH, np.ascontiguousarray(T_MH.t), t_k,
+        s,
+        index,
+        np.ascontiguousarray(T_HT.R),
+        np.ascontiguousarray(T_HT.t),
+        R_MH,
+        np.ascontiguousarray(T_MH.t),
+        t_k,
         angle,
     )
     return ProjectionBlocks(

@@ -23,8 +23,19 @@ PER_RUN = ("d_SR", "axis_y")
 
 MATTERS: Mapping[str, float] = MappingProxyType(
     {
-        "d_SD": 1.5, "d_SR": 0.3, "p_u": 2e-4, "p_v": 2e-4, "u_0": 1.0, "v_0": 1.0, "eta": 1e-3, "theta": 5e-3,
-        "phi": 5e-3, "pitch_ratio": 1e-3, "axis_y": 0.05, "axis_tilt_x": 1e-3, "axis_tilt_y": 1e-3,
+        "d_SD": 1.5,
+        "d_SR": 0.3,
+        "p_u": 2e-4,
+        "p_v": 2e-4,
+        "u_0": 1.0,
+        "v_0": 1.0,
+        "eta": 1e-3,
+        "theta": 5e-3,
+        "phi": 5e-3,
+        "pitch_ratio": 1e-3,
+        "axis_y": 0.05,
+        "axis_tilt_x": 1e-3,
+        "axis_tilt_y": 1e-3,
         "translation_scale": 1e-3,
     }
 )

@@ -89,14 +89,20 @@ def twin_blocks(
     f_u, f_v = -1 / scanner.p_u, 1 / scanner.p_v
     zero = np.zeros_like(l)
     dl_c = (scanner.d_SD - z) / depth**2
-    g_ball = np.stack([
-        np.stack([f_u * l, zero, -f_u * (x - a) * l / depth], axis=1),
-        np.stack([zero, f_v * l, -f_v * (y - b) * l / depth], axis=1),
-    ], axis=1)
-    g_spot = np.stack([
-        np.stack([f_u * (1 - l), zero, f_u * (x - a) * dl_c], axis=1),
-        np.stack([zero, f_v * (1 - l), f_v * (y - b) * dl_c], axis=1),
-    ], axis=1)
+    g_ball = np.stack(
+        [
+            np.stack([f_u * l, zero, -f_u * (x - a) * l / depth], axis=1),
+            np.stack([zero, f_v * l, -f_v * (y - b) * l / depth], axis=1),
+        ],
+        axis=1,
+    )
+    g_spot = np.stack(
+        [
+            np.stack([f_u * (1 - l), zero, f_u * (x - a) * dl_c], axis=1),
+            np.stack([zero, f_v * (1 - l), f_v * (y - b) * dl_c], axis=1),
+        ],
+        axis=1,
+    )
     J_pose = g_ball @ ball.J_pose + g_spot @ spot.J_pose
     by_spot = g_spot @ spot.J_point
     x_D = np.stack([scanner.u_0 + f_u * (a + l * (x - a)), scanner.v_0 + f_v * (b + l * (y - b))], axis=1)

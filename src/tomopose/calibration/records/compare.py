@@ -46,9 +46,16 @@ class Comparison:
 
     def to_json(self) -> dict[str, Any]:
         return {
-            "names": list(self.names), "difference": self.difference.tolist(), "u": self.u.tolist(),
-            "z": self.z.tolist(), "p": self.p.tolist(), "chi2_mount": self.chi2_mount, "p_mount": self.p_mount,
-            "chi2_all": self.chi2_all, "p_all": self.p_all, "words": list(self.words),
+            "names": list(self.names),
+            "difference": self.difference.tolist(),
+            "u": self.u.tolist(),
+            "z": self.z.tolist(),
+            "p": self.p.tolist(),
+            "chi2_mount": self.chi2_mount,
+            "p_mount": self.p_mount,
+            "chi2_all": self.chi2_all,
+            "p_all": self.p_all,
+            "words": list(self.words),
         }
 
 
@@ -83,13 +90,22 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
     chi2_all, p_all = _together(d, C)
     p = _two_sided(z)
     return Comparison(
-        names=names, difference=d, u=u, z=z, p=p, chi2_mount=chi2_mount, p_mount=p_mount, chi2_all=chi2_all,
-        p_all=p_all, words=_words(a, b, names, z, p_mount, p_all),
+        names=names,
+        difference=d,
+        u=u,
+        z=z,
+        p=p,
+        chi2_mount=chi2_mount,
+        p_mount=p_mount,
+        chi2_all=chi2_all,
+        p_all=p_all,
+        words=_words(a, b, names, z, p_mount, p_all),
     )
 
 
-def _words(a: Calibration, b: Calibration, names: tuple[str, ...], z: Array, p_mount: float,
-           p_all: float) -> tuple[str, ...]:
+def _words(
+    a: Calibration, b: Calibration, names: tuple[str, ...], z: Array, p_mount: float, p_all: float
+) -> tuple[str, ...]:
     words = [
         f"the mount T_HT {'changed significantly' if p_mount < SIGNIFICANT else 'did not change significantly'} "
         f"(p = {p_mount:.2g})"

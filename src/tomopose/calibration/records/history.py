@@ -121,8 +121,8 @@ def _limits(value: Array, u: Array, judges: Array) -> tuple[Array, Array]:
         centre, of_centre, between = _centre_and_scatter(value[others], u[others])
         variance = u[k] ** 2 + between + of_centre
         # Welch and Satterthwaite: only the between-runs part is uncertain
-        factor = LIMIT_SIGMAS if between == 0.0 else -float(
-            stdtrit((others.sum() - 1) * (variance / between) ** 2, tail)
+        factor = (
+            LIMIT_SIGMAS if between == 0.0 else -float(stdtrit((others.sum() - 1) * (variance / between) ** 2, tail))
         )
         low[k], high[k] = centre - factor * np.sqrt(variance), centre + factor * np.sqrt(variance)
     return low, high
@@ -154,8 +154,16 @@ def control_chart(entries: Iterable[Mapping[str, Any]], name: str) -> ControlCha
         low, high = _limits(value, u, inside)
     centre, _, between = _centre_and_scatter(value[inside], u[inside])
     return ControlChart(
-        name=name, unit=unit, time=tuple(str(e["time_utc"]) for e in rows), value=value, u=u, centre=centre,
-        scatter=float(np.sqrt(between)), low=low, high=high, out=(value < low) | (value > high),
+        name=name,
+        unit=unit,
+        time=tuple(str(e["time_utc"]) for e in rows),
+        value=value,
+        u=u,
+        centre=centre,
+        scatter=float(np.sqrt(between)),
+        low=low,
+        high=high,
+        out=(value < low) | (value > high),
         trend_p=_trend_p(np.flatnonzero(inside).astype(np.float64), value[inside]),
     )
 

@@ -29,8 +29,11 @@ def _median_residual(problem: Problem, free: FreeParameters, fit: Fit) -> tuple[
     r = residuals(problem, free, fit)
     d2 = whitened2(problem, r)
     # a centre that is not finite makes the median so too
-    return (float(np.median(d2)), float(np.sqrt(np.median((r * r).sum(axis=1))))) if np.isfinite(d2).all() else (
-        np.inf, np.inf)
+    return (
+        (float(np.median(d2)), float(np.sqrt(np.median((r * r).sum(axis=1)))))
+        if np.isfinite(d2).all()
+        else (np.inf, np.inf)
+    )
 
 
 def _poor(problem: Problem, free: FreeParameters, fit: Fit) -> tuple[bool, float]:
@@ -59,7 +62,7 @@ def best_fit(problem: Problem, free: FreeParameters) -> Fit:
 
 def _prior_rows(free: FreeParameters, m: int) -> Array:
     rows = np.zeros((len(free), m))
-    rows[:, m - len(free):] = np.diag(np.sqrt(free.information))
+    rows[:, m - len(free) :] = np.diag(np.sqrt(free.information))
     return rows[free.information > 0]
 
 
@@ -120,7 +123,11 @@ class Solution:
 
 
 def solve(
-    problem: Problem, free: FreeParameters, *, robust: bool = True, start: Fit | None = None,
+    problem: Problem,
+    free: FreeParameters,
+    *,
+    robust: bool = True,
+    start: Fit | None = None,
     noise: PoseNoise | None = None,
 ) -> Solution:
     """Best fit, outliers set aside, observability demanded, covariance by the stated rule."""
@@ -132,8 +139,10 @@ def solve(
     # judged by detection noise alone: pose noise as large as a mistake would hide behind "not observable"
     if noise is None:
         require_observable(problem, free, jacobian(problem, free, blocks(problem, free, first)))
-    result = robust_fit(problem, free, first) if robust else RobustFit(
-        fit=first, keep=everything, distance2=np.full(len(problem), np.nan), scale=np.nan, misfit=False
+    result = (
+        robust_fit(problem, free, first)
+        if robust
+        else RobustFit(fit=first, keep=everything, distance2=np.full(len(problem), np.nan), scale=np.nan, misfit=False)
     )
     used = problem.select(result.keep)
     b = blocks(used, free, result.fit)
@@ -145,7 +154,15 @@ def solve(
         raise InputError(f"{len(used)} poses leave no degree of freedom for {J.shape[2]} unknowns; image more poses")
     chi2 = result.fit.chi2
     return Solution(
-        problem=problem, used=used, noise=noise, free=free, robust=result, J=J, x_calc=b.x_D, chi2=chi2, dof=dof,
+        problem=problem,
+        used=used,
+        noise=noise,
+        free=free,
+        robust=result,
+        J=J,
+        x_calc=b.x_D,
+        chi2=chi2,
+        dof=dof,
         covariance=inverse_information(result.fit.N) * widening(chi2, dof),
     )
 
@@ -175,9 +192,7 @@ def with_pose_noise(solution: Solution, pose_noise: Any, *, robust: bool = True)
         used = original.select(solution.robust.keep)
         at = blocks(used, solution.free, solution.fit)
         if isinstance(pose_noise, str):
-            noise = estimate_pose_noise(
-                used.covariance, at, jacobian(used, solution.free, at), used.x_D - at.x_D
-            )
+            noise = estimate_pose_noise(used.covariance, at, jacobian(used, solution.free, at), used.x_D - at.x_D)
         else:
             noise = PoseNoise(translation=float(pose_noise[0]), rotation=float(pose_noise[1]))
         if noise.translation == noise.rotation == 0.0:

@@ -52,8 +52,25 @@ def minimise(
     N = np.zeros((m, m))
     w = np.ones(len(problem)) if weight is None else np.ascontiguousarray(weight, dtype=np.float64)
     chi2, status = levenberg_marquardt(
-        problem.x_D, problem.W, w, problem.R_MH, problem.t_MH, problem.alpha, problem.run, problem.ball, problem.s_0,
-        free.cols, free.col_run, free.factor, free.information, R, t_HT, t, delta, iterations, N,
+        problem.x_D,
+        problem.W,
+        w,
+        problem.R_MH,
+        problem.t_MH,
+        problem.alpha,
+        problem.run,
+        problem.ball,
+        problem.s_0,
+        free.cols,
+        free.col_run,
+        free.factor,
+        free.information,
+        R,
+        t_HT,
+        t,
+        delta,
+        iterations,
+        N,
     )
     U, _, V = np.linalg.svd(R)
     return Fit(R_HT=U @ V, t_HT=t_HT, t=t, delta=delta, chi2=float(chi2), converged=status == CONVERGED, N=N)
@@ -62,8 +79,19 @@ def minimise(
 def residuals(problem: Problem, free: FreeParameters, fit: Fit) -> Array:
     """(n, 2) px: observed minus calculated centres; NaN where a ball would be behind the source."""
     return problem.x_D - centres(
-        problem.R_MH, problem.t_MH, problem.alpha, problem.run, problem.ball, problem.s_0, free.cols, free.col_run,
-        free.factor, np.ascontiguousarray(fit.R_HT), fit.t_HT, fit.t, fit.delta,
+        problem.R_MH,
+        problem.t_MH,
+        problem.alpha,
+        problem.run,
+        problem.ball,
+        problem.s_0,
+        free.cols,
+        free.col_run,
+        free.factor,
+        np.ascontiguousarray(fit.R_HT),
+        fit.t_HT,
+        fit.t,
+        fit.delta,
     )
 
 

@@ -81,8 +81,19 @@ def _scanner_vectors(s_0: Array, cols: Any, col_run: Any, factor: Array, delta: 
 
 @njit(cache=True)
 def centres(
-    R_k: Array, t_k: Array, alpha: Array, run: Any, ball: Any, s_0: Array, cols: Any, col_run: Any, factor: Array,
-    R_HT: Array, t_HT: Array, t: Array, delta: Array,
+    R_k: Array,
+    t_k: Array,
+    alpha: Array,
+    run: Any,
+    ball: Any,
+    s_0: Array,
+    cols: Any,
+    col_run: Any,
+    factor: Array,
+    R_HT: Array,
+    t_HT: Array,
+    t: Array,
+    delta: Array,
 ) -> Array:
     """(n, 2) px: the calculated centres, without derivatives; NaN where a ball is behind the source."""
     n = R_k.shape[0]
@@ -100,9 +111,26 @@ def centres(
 
 @njit(cache=True)
 def normal_equations(
-    x_meas: Array, W: Array, weight: Array, R_k: Array, t_k: Array, alpha: Array, run: Any, ball: Any, s: Array,
-    cols: Any, col_run: Any, factor: Array, information: Array, R_HT: Array, t_HT: Array, t: Array, delta: Array,
-    derivatives: bool, N: Array, g: Array,
+    x_meas: Array,
+    W: Array,
+    weight: Array,
+    R_k: Array,
+    t_k: Array,
+    alpha: Array,
+    run: Any,
+    ball: Any,
+    s: Array,
+    cols: Any,
+    col_run: Any,
+    factor: Array,
+    information: Array,
+    R_HT: Array,
+    t_HT: Array,
+    t: Array,
+    delta: Array,
+    derivatives: bool,
+    N: Array,
+    g: Array,
 ) -> float:
     """chi2 at a point; with `derivatives` also N = J^T J and g = J^T r (r = observed - calculated, whitened).
 
@@ -171,9 +199,25 @@ def normal_equations(
 
 @njit(cache=True)
 def levenberg_marquardt(
-    x_meas: Array, W: Array, weight: Array, R_k: Array, t_k: Array, alpha: Array, run: Any, ball: Any, s_0: Array,
-    cols: Any, col_run: Any, factor: Array, information: Array, R_HT: Array, t_HT: Array, t: Array, delta: Array,
-    iterations: int, N: Array,
+    x_meas: Array,
+    W: Array,
+    weight: Array,
+    R_k: Array,
+    t_k: Array,
+    alpha: Array,
+    run: Any,
+    ball: Any,
+    s_0: Array,
+    cols: Any,
+    col_run: Any,
+    factor: Array,
+    information: Array,
+    R_HT: Array,
+    t_HT: Array,
+    t: Array,
+    delta: Array,
+    iterations: int,
+    N: Array,
 ) -> tuple[float, int]:
     """Minimise chi2 from (R_HT, t_HT, t, delta), which are overwritten by the optimum; N becomes J^T J there.
 
@@ -187,8 +231,26 @@ def levenberg_marquardt(
     R_new, t_HT_new, t_new, delta_new = R_HT.copy(), t_HT.copy(), t.copy(), delta.copy()
     _scanner_vectors(s_0, cols, col_run, factor, delta, s)
     chi2 = normal_equations(
-        x_meas, W, weight, R_k, t_k, alpha, run, ball, s, cols, col_run, factor, information, R_HT, t_HT, t, delta,
-        True, N, g,
+        x_meas,
+        W,
+        weight,
+        R_k,
+        t_k,
+        alpha,
+        run,
+        ball,
+        s,
+        cols,
+        col_run,
+        factor,
+        information,
+        R_HT,
+        t_HT,
+        t,
+        delta,
+        True,
+        N,
+        g,
     )
     if not chi2 < np.inf:
         return np.inf, SINGULAR
@@ -212,8 +274,26 @@ def levenberg_marquardt(
             delta_new[j] = delta[j] + step[6 + 3 * n_b + j]
         _scanner_vectors(s_0, cols, col_run, factor, delta_new, s)
         chi2_new = normal_equations(
-            x_meas, W, weight, R_k, t_k, alpha, run, ball, s, cols, col_run, factor, information, R_new, t_HT_new,
-            t_new, delta_new, True, N_new, g_new,
+            x_meas,
+            W,
+            weight,
+            R_k,
+            t_k,
+            alpha,
+            run,
+            ball,
+            s,
+            cols,
+            col_run,
+            factor,
+            information,
+            R_new,
+            t_HT_new,
+            t_new,
+            delta_new,
+            True,
+            N_new,
+            g_new,
         )
         small = length < STEP_TOLERANCE * STEP_TOLERANCE
         if chi2_new < chi2 or (small and chi2_new < np.inf) or chi2_new == chi2:
@@ -250,9 +330,26 @@ def _log_rotation(D: Array, out: Array) -> None:
 
 @njit(cache=True)
 def _solve_one(
-    x: Array, W: Array, weight: Array, R_k: Array, t_k: Array, alpha: Array, run: Any, ball: Any, s_0: Array, cols: Any,
-    col_run: Any, factor: Array, information: Array, centre: Array, R_HT: Array, t_HT: Array, t: Array, delta: Array,
-    iterations: int, theta: Array,
+    x: Array,
+    W: Array,
+    weight: Array,
+    R_k: Array,
+    t_k: Array,
+    alpha: Array,
+    run: Any,
+    ball: Any,
+    s_0: Array,
+    cols: Any,
+    col_run: Any,
+    factor: Array,
+    information: Array,
+    centre: Array,
+    R_HT: Array,
+    t_HT: Array,
+    t: Array,
+    delta: Array,
+    iterations: int,
+    theta: Array,
 ) -> tuple[float, int]:
     """One solve from a start, its result written into theta (m,)."""
     n_b, n_f = t.shape[0], cols.shape[0]
@@ -261,13 +358,30 @@ def _solve_one(
     s_b, N = s_0.copy(), np.zeros((m, m))
     _scanner_vectors(s_0, cols, col_run, factor, centre, s_b)
     chi2, status = levenberg_marquardt(
-        x, W, weight, R_k, t_k, alpha, run, ball, s_b, cols, col_run, factor, information, R_b, t_HT_b, t_b, delta_b,
-        iterations, N,
+        x,
+        W,
+        weight,
+        R_k,
+        t_k,
+        alpha,
+        run,
+        ball,
+        s_b,
+        cols,
+        col_run,
+        factor,
+        information,
+        R_b,
+        t_HT_b,
+        t_b,
+        delta_b,
+        iterations,
+        N,
     )
     _log_rotation(R_b @ R_HT.T, theta)
     theta[3:6] = t_HT_b
     for j in range(n_b):
-        theta[6 + 3 * j:9 + 3 * j] = t_b[j]
+        theta[6 + 3 * j : 9 + 3 * j] = t_b[j]
     for j in range(n_f):
         theta[6 + 3 * n_b + j] = centre[j] + delta_b[j]
     return chi2, status
@@ -275,9 +389,25 @@ def _solve_one(
 
 @njit(cache=True, parallel=True)
 def solve_batch(
-    x_all: Array, W: Array, weight: Array, R_all: Array, t_all: Array, alpha: Array, run: Any, ball: Any, s_0: Array,
-    cols: Any, col_run: Any, factor: Array, information: Array, prior: Array, R_HT: Array, t_HT: Array, t: Array,
-    delta: Array, iterations: int,
+    x_all: Array,
+    W: Array,
+    weight: Array,
+    R_all: Array,
+    t_all: Array,
+    alpha: Array,
+    run: Any,
+    ball: Any,
+    s_0: Array,
+    cols: Any,
+    col_run: Any,
+    factor: Array,
+    information: Array,
+    prior: Array,
+    R_HT: Array,
+    t_HT: Array,
+    t: Array,
+    delta: Array,
+    iterations: int,
 ) -> Any:
     """Many solves of one plan, from one start: x_all (b, n, 2); R_all (b or 1, n, 3, 3), t_all (b or 1, n, 3).
 
@@ -290,7 +420,25 @@ def solve_batch(
     for b in prange(n_s):
         i, j = b % prior.shape[0], b % R_all.shape[0]
         chi2[b], status[b] = _solve_one(
-            x_all[b], W, weight, R_all[j], t_all[j], alpha, run, ball, s_0, cols, col_run, factor, information,
-            prior[i], R_HT, t_HT, t, delta, iterations, theta[b],
+            x_all[b],
+            W,
+            weight,
+            R_all[j],
+            t_all[j],
+            alpha,
+            run,
+            ball,
+            s_0,
+            cols,
+            col_run,
+            factor,
+            information,
+            prior[i],
+            R_HT,
+            t_HT,
+            t,
+            delta,
+            iterations,
+            theta[b],
         )
     return theta, chi2, status

@@ -30,20 +30,30 @@ SHOWN = 0.25
 
 def scales(names: tuple[str, ...]) -> Array:
     """(m,) natural size of each coordinate: 1 mm, 0.1 rad, or what matters of a scanner parameter."""
-    return np.array([
-        0.1 if n.startswith("w_HT") else 1.0 if n.startswith("t") and base_name(n) not in MATTERS
-        else MATTERS[base_name(n)]
-        for n in names
-    ])
+    return np.array(
+        [
+            0.1
+            if n.startswith("w_HT")
+            else 1.0
+            if n.startswith("t") and base_name(n) not in MATTERS
+            else MATTERS[base_name(n)]
+            for n in names
+        ]
+    )
 
 
 def useless(names: tuple[str, ...]) -> Array:
     """(m,) standard uncertainty beyond which a coordinate counts as unknown."""
-    return np.array([
-        USELESS_RAD if n.startswith("w_HT") else USELESS_FACTOR * MATTERS[base_name(n)] if base_name(n) in MATTERS
-        else USELESS_MM
-        for n in names
-    ])
+    return np.array(
+        [
+            USELESS_RAD
+            if n.startswith("w_HT")
+            else USELESS_FACTOR * MATTERS[base_name(n)]
+            if base_name(n) in MATTERS
+            else USELESS_MM
+            for n in names
+        ]
+    )
 
 
 def singular_values(J: Array) -> tuple[Array, Array]:
@@ -135,8 +145,9 @@ def assumed_report(problem: Problem, J_assumed: Array, J: Array, names: tuple[st
     return tuple(sentences)
 
 
-def observability(problem: Problem, free: FreeParameters, J: Array, J_assumed: Array,
-                  assumed: tuple[str, ...]) -> Observability:
+def observability(
+    problem: Problem, free: FreeParameters, J: Array, J_assumed: Array, assumed: tuple[str, ...]
+) -> Observability:
     """The report of a fit; J (n, 2, m) and J_assumed (n, 2, a) in px, without priors."""
     names = tangent_names(problem.ball_ids, free)
     whitened = (problem.W @ J).reshape(-1, J.shape[2])

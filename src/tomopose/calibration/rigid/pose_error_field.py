@@ -126,8 +126,13 @@ def _restricted(V: Array, J: Array, r: Array) -> float:
 
 
 def estimate_pose_field(
-    problems: Sequence[Problem], free: FreeParameters, fits: Sequence[Fit], *, length: float | None = None,
-    angle: float | None = np.inf, base: str = "H",
+    problems: Sequence[Problem],
+    free: FreeParameters,
+    fits: Sequence[Fit],
+    *,
+    length: float | None = None,
+    angle: float | None = np.inf,
+    base: str = "H",
 ) -> PoseField:
     """The field from fits of the same machine.
 
@@ -138,10 +143,16 @@ def estimate_pose_field(
         b = blocks(problem, free, fit)
         J = jacobian(problem, free, b).reshape(2 * len(problem), -1)
         G, L, place = lever_blocks(b, problem.t_MH, base)
-        data.append((
-            J / np.linalg.norm(J, axis=0), (problem.x_D - b.x_D).ravel(), _detection(problem), G, L,
-            _closeness(problem, place),
-        ))
+        data.append(
+            (
+                J / np.linalg.norm(J, axis=0),
+                (problem.x_D - b.x_D).ravel(),
+                _detection(problem),
+                G,
+                L,
+                _closeness(problem, place),
+            )
+        )
     squares = float(np.mean([r @ r for _, r, *_ in data]))
     # units of the search: each kind of error alone explaining the residuals; the largest way and turn of the poses
     levers = zip(*((G, L) for *_, G, L, _ in data), strict=True)
@@ -151,8 +162,11 @@ def estimate_pose_field(
     def field(q: Array) -> PoseField:
         s, rest = np.exp(q), list(np.exp(q[4:]))
         return PoseField(
-            translation=float(size[0] * s[0]), rotation=float(size[1] * s[1]), base=base,
-            field_translation=float(size[0] * s[2]), field_rotation=float(size[1] * s[3]),
+            translation=float(size[0] * s[0]),
+            rotation=float(size[1] * s[1]),
+            base=base,
+            field_translation=float(size[0] * s[2]),
+            field_rotation=float(size[1] * s[3]),
             length=float(way * rest.pop(0)) if length is None else length,
             angle=float(turn * rest.pop(0)) if angle is None else angle,
         )
@@ -165,8 +179,12 @@ def estimate_pose_field(
 
     lengths = [0.5] * ((length is None) + (angle is None))
     found = [
-        minimize(objective, [*start, *lengths], method="Nelder-Mead",
-                 options={"xatol": 2e-2, "fatol": 1e-2 * len(data), "maxiter": EVALUATIONS, "adaptive": True})
+        minimize(
+            objective,
+            [*start, *lengths],
+            method="Nelder-Mead",
+            options={"xatol": 2e-2, "fatol": 1e-2 * len(data), "maxiter": EVALUATIONS, "adaptive": True},
+        )
         for start in ([-1.0, -1.0, -0.7, -3.0], [-1.5, -0.7, -3.0, -0.7])
     ]
     return field(min(found, key=lambda result: float(result.fun)).x)
@@ -180,18 +198,21 @@ def solve_with_field(problem: Problem, free: FreeParameters, start: Fit, field: 
     root: Array = np.asarray(np.linalg.cholesky(field_covariance(problem, free, start, field)), dtype=np.float64)
     m, n_b = 6 + start.t.size + len(free), len(start.t)
     prior = np.zeros((m, m))
-    prior[m - len(free):, m - len(free):] = np.diag(free.information)
+    prior[m - len(free) :, m - len(free) :] = np.diag(free.information)
     fit, damping = start, 1e-3
     b, rw, chi2 = _whitened(problem, free, fit, root)
     for _ in range(ITERATIONS):
         J = np.linalg.solve(root, jacobian(problem, free, b).reshape(-1, m))
         N = J.T @ J + prior
         g = J.T @ rw
-        g[m - len(free):] -= free.information * fit.delta
+        g[m - len(free) :] -= free.information * fit.delta
         step = np.asarray(np.linalg.solve(N + damping * np.diag(np.diag(N)), g), dtype=np.float64)
         trial = replace(
-            fit, R_HT=exp_rotation(step[:3]) @ fit.R_HT, t_HT=fit.t_HT + step[3:6],
-            t=fit.t + step[6:6 + 3 * n_b].reshape(n_b, 3), delta=fit.delta + step[6 + 3 * n_b:],
+            fit,
+            R_HT=exp_rotation(step[:3]) @ fit.R_HT,
+            t_HT=fit.t_HT + step[3:6],
+            t=fit.t + step[6 : 6 + 3 * n_b].reshape(n_b, 3),
+            delta=fit.delta + step[6 + 3 * n_b :],
         )
         b_new, r_new, chi2_new = _whitened(problem, free, trial, root)
         if chi2_new <= chi2:

@@ -55,8 +55,10 @@ def estimate_pose_noise(covariance: Array, b: ProjectionBlocks, J: Array, r: Arr
     A, B = pose_spread(b)
     d2 = float(np.mean((r**2).sum(axis=1)))
     # starts: each component alone explaining the whole of the residual
-    s_A, s_B = np.sqrt(d2 / np.mean(np.trace(A, axis1=1, axis2=2))), np.sqrt(
-        d2 / max(np.mean(np.trace(B, axis1=1, axis2=2)), 1e-300))
+    s_A, s_B = (
+        np.sqrt(d2 / np.mean(np.trace(A, axis1=1, axis2=2))),
+        np.sqrt(d2 / max(np.mean(np.trace(B, axis1=1, axis2=2)), 1e-300)),
+    )
     scale = 1.0 / np.maximum(np.linalg.norm(J, axis=(0, 1)), 1e-300)
     Js = J * scale
 
@@ -71,10 +73,20 @@ def estimate_pose_noise(covariance: Array, b: ProjectionBlocks, J: Array, r: Arr
 
     none = objective(np.array([-40.0, -40.0]))
     best = min(
-        (minimize(objective, start, method="Nelder-Mead",
-                  options={"initial_simplex": np.array(start) + [[0, 0], [1.0, 0], [0, 1.0]], "xatol": 1e-3,
-                           "fatol": 1e-3, "maxiter": 200})
-         for start in ([-0.5, -1.0], [-6.0, -0.3])),
+        (
+            minimize(
+                objective,
+                start,
+                method="Nelder-Mead",
+                options={
+                    "initial_simplex": np.array(start) + [[0, 0], [1.0, 0], [0, 1.0]],
+                    "xatol": 1e-3,
+                    "fatol": 1e-3,
+                    "maxiter": 200,
+                },
+            )
+            for start in ([-0.5, -1.0], [-6.0, -0.3])
+        ),
         key=lambda result: float(result.fun),
     )
     gain = none - float(best.fun)

@@ -128,8 +128,10 @@ def _cube_rotations() -> Array:
     """(72, 3, 3): the 24 rotations of the cube, then the same turned by 45 degrees about (1,1,1) and (1,-1,0)."""
     cube = Rotation.create_group("O").as_matrix()
     turns = [np.eye(3)]
-    turns += [Rotation.from_rotvec(np.pi / 4 * np.array(a) / np.linalg.norm(a)).as_matrix() for a in
-              ((1.0, 1.0, 1.0), (1.0, -1.0, 0.0))]
+    turns += [
+        Rotation.from_rotvec(np.pi / 4 * np.array(a) / np.linalg.norm(a)).as_matrix()
+        for a in ((1.0, 1.0, 1.0), (1.0, -1.0, 0.0))
+    ]
     return np.concatenate([cube @ turn for turn in turns])
 
 

@@ -54,7 +54,7 @@ class MonteCarlo:
         e = np.sort(self.errors[np.asarray(self.converged, dtype=bool)], axis=0)
         n = len(e)
         k = min(max(int(np.ceil(probability * n)), 1), n)
-        width = e[k - 1:] - e[: n - k + 1]
+        width = e[k - 1 :] - e[: n - k + 1]
         first = width.argmin(axis=0)
         columns = np.arange(e.shape[1])
         return np.column_stack([e[first, columns], e[first + k - 1, columns]])
@@ -88,10 +88,25 @@ def draw(
         prior = sigma * rng.standard_normal((b, f)) + truth.delta if f else np.zeros((1, 0))
         parts.append(
             solve_batch(
-                np.ascontiguousarray(x), weighted.W, ones, np.ascontiguousarray(R), np.ascontiguousarray(t),
-                problem.alpha, problem.run, problem.ball, problem.s_0, free.cols, free.col_run, free.factor,
-                free.information, np.ascontiguousarray(prior), np.ascontiguousarray(truth.R_HT), truth.t_HT.copy(),
-                truth.t.copy(), truth.delta.copy(), ITERATIONS,
+                np.ascontiguousarray(x),
+                weighted.W,
+                ones,
+                np.ascontiguousarray(R),
+                np.ascontiguousarray(t),
+                problem.alpha,
+                problem.run,
+                problem.ball,
+                problem.s_0,
+                free.cols,
+                free.col_run,
+                free.factor,
+                free.information,
+                np.ascontiguousarray(prior),
+                np.ascontiguousarray(truth.R_HT),
+                truth.t_HT.copy(),
+                truth.t.copy(),
+                truth.delta.copy(),
+                ITERATIONS,
             )
         )
     theta, chi2, status = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -122,13 +137,19 @@ def monte_carlo(
     free = _free_of(calibration, problem)
     values = {p.name: p.value for p in calibration.parameters}
     truth = Fit(
-        R_HT=calibration.T_HT.R, t_HT=calibration.T_HT.t, t=np.array([calibration.balls[b] for b in problem.ball_ids]),
-        delta=np.array([values[name] for name in free.names]) - free.value, chi2=calibration.chi2, converged=True,
+        R_HT=calibration.T_HT.R,
+        t_HT=calibration.T_HT.t,
+        t=np.array([calibration.balls[b] for b in problem.ball_ids]),
+        delta=np.array([values[name] for name in free.names]) - free.value,
+        chi2=calibration.chi2,
+        converged=True,
         N=np.zeros((0, 0)),
     )
     found = calibration.extra.get("pose_noise")
-    noise = None if found is None else PoseNoise(
-        translation=float(found["translation_mm"]), rotation=float(found["rotation_rad"])
+    noise = (
+        None
+        if found is None
+        else PoseNoise(translation=float(found["translation_mm"]), rotation=float(found["rotation_rad"]))
     )
     return draw(problem, free, truth, draws, seed=seed, noise=noise)
 

@@ -132,9 +132,7 @@ def scatter_variance(calibration: Calibration, poses: PoseSequence, x_M: Any) ->
     return V
 
 
-def trajectory_sigma(
-    calibration: Calibration, poses: PoseSequence, points: Any, *, scatter: bool = False
-) -> Array:
+def trajectory_sigma(calibration: Calibration, poses: PoseSequence, points: Any, *, scatter: bool = False) -> Array:
     """(n, m, 2) px: standard uncertainty of points (m, 3) of W at home in a scan, the object's rigid pose removed.
 
     scatter: add the manipulator's scatter from pose to pose, for the single view; else the part that views share.

@@ -59,7 +59,11 @@ class Candidate:
 
 
 def find_ball(
-    image: Array, expected_radius: float, aspect: float = 1.0, *, smallest: float = 3.5,
+    image: Array,
+    expected_radius: float,
+    aspect: float = 1.0,
+    *,
+    smallest: float = 3.5,
     near: tuple[float, float] | None = None,
 ) -> tuple[Candidate, tuple[Candidate, ...]]:
     """The ball and all candidates, best first.

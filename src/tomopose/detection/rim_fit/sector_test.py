@@ -45,9 +45,7 @@ def rounder(rim: Rim, active: npt.NDArray[np.intp], doubt: Array, *, parameters:
 
     def kept(residual: Array) -> Array:
         """Share of its weight that these residuals leave each sector."""
-        return np.asarray(
-            trust(rim.rim[0], rim.left, rim.share, residual, rim.weight, rim.n_nodes, parameters, noise)
-        )
+        return np.asarray(trust(rim.rim[0], rim.left, rim.share, residual, rim.weight, rim.n_nodes, parameters, noise))
 
     share = kept(residual)
     if share.min() > TRUSTED:

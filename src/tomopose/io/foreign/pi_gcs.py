@@ -91,7 +91,11 @@ def _renamed(table: TextTable) -> TextTable:
     if "pose_id" not in columns:
         columns, rows = ("pose_id", *columns), tuple((str(k), *row) for k, row in enumerate(rows))
     return TextTable(
-        path=table.path, comments=table.comments, columns=columns, rows=rows, lines=table.lines,
+        path=table.path,
+        comments=table.comments,
+        columns=columns,
+        rows=rows,
+        lines=table.lines,
         decimal_comma=table.decimal_comma,
     )
 

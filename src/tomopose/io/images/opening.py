@@ -22,11 +22,26 @@ from tomopose.io.images.sequence import ImageSequence, Rows
 from tomopose.io.images.tiff import open_tiff
 
 SUFFIXES = {
-    ".tif": "TIFF", ".tiff": "TIFF", ".dcm": "DICOM", ".dicom": "DICOM", ".ima": "DICOM",
-    ".h5": "HDF5", ".hdf5": "HDF5", ".nxs": "HDF5", ".hdf": "HDF5", ".raw": "RAW", ".bin": "RAW",
+    ".tif": "TIFF",
+    ".tiff": "TIFF",
+    ".dcm": "DICOM",
+    ".dicom": "DICOM",
+    ".ima": "DICOM",
+    ".h5": "HDF5",
+    ".hdf5": "HDF5",
+    ".nxs": "HDF5",
+    ".hdf": "HDF5",
+    ".raw": "RAW",
+    ".bin": "RAW",
 }
 REFUSED = {
-    ".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG", ".bmp": "BMP", ".gif": "GIF", ".webp": "WebP", ".jp2": "JPEG 2000",
+    ".jpg": "JPEG",
+    ".jpeg": "JPEG",
+    ".png": "PNG",
+    ".bmp": "BMP",
+    ".gif": "GIF",
+    ".webp": "WebP",
+    ".jp2": "JPEG 2000",
 }
 MAGIC = ((b"II*\0", "TIFF"), (b"MM\0*", "TIFF"), (b"II+\0", "TIFF"), (b"MM\0+", "TIFF"), (b"\x89HDF", "HDF5"))
 SHOWN = 5

@@ -81,6 +81,9 @@ def open_raw(paths: list[Path], names: list[str], layout: RawLayout) -> RawSourc
             frames.append((path, layout.header + k * step))
             frame_names.append(f"{name}[{k}]" if count > 1 else name)
     return RawSource(
-        names=tuple(frame_names), shape=layout.shape, dtype=stored.newbyteorder("="), stored=stored,
+        names=tuple(frame_names),
+        shape=layout.shape,
+        dtype=stored.newbyteorder("="),
+        stored=stored,
         frames=tuple(frames),
     )

@@ -98,6 +98,10 @@ class ImageSequence:
         """The images with those indices (or that mask), in that order."""
         chosen = np.arange(len(self))[np.asarray(index)] if len(index) else np.empty(0, np.intp)
         return ImageSequence(
-            source=self.source, rows=self.rows, index=tuple(self.index[int(i)] for i in chosen),
-            correction=self.correction, bad_pixels=self.bad_pixels, warnings=self.warnings,
+            source=self.source,
+            rows=self.rows,
+            index=tuple(self.index[int(i)] for i in chosen),
+            correction=self.correction,
+            bad_pixels=self.bad_pixels,
+            warnings=self.warnings,
         )

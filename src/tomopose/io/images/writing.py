@@ -51,7 +51,10 @@ def write_hdf5(
         for image in images:
             if stack is None:
                 stack = file.create_dataset(
-                    dataset, shape=(0, *image.shape), maxshape=(None, *image.shape), dtype=image.dtype,
+                    dataset,
+                    shape=(0, *image.shape),
+                    maxshape=(None, *image.shape),
+                    dtype=image.dtype,
                     chunks=(1, min(CHUNK_ROWS, image.shape[0]), image.shape[1]),
                 )
                 stack.attrs["image_rows"] = rows

@@ -87,9 +87,7 @@ def independence(
     return Independence(variance=L * total / freedom, n_effective=n / L, dof=dof)
 
 
-def _sums(
-    points: Array, residuals: Array, derivatives: Array, reach: float, root: Array
-) -> tuple[Array, Array, Array]:
+def _sums(points: Array, residuals: Array, derivatives: Array, reach: float, root: Array) -> tuple[Array, Array, Array]:
     """Cumulative over BINS of distance up to reach: points within it (mean), sums of r_i r_j and of H_ij over pairs,
     each times the root (n,) of both weights.
 

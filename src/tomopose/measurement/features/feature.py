@@ -136,8 +136,13 @@ class Feature:
             "kind": self.kind,
             "parameters": {n: v for n, v in zip(PARAMETERS, self.vector.tolist(), strict=True) if math.isfinite(v)},
             "u": {n: u for n, u, v in zip(PARAMETERS, self.u.tolist(), self.vector, strict=True) if math.isfinite(v)},
-            "n_points": len(self.points), "n_used": self.n_used, "n_effective": self.n_effective, "dof": self.dof,
-            "rms_mm": self.rms, "form_mm": self.form, "form_95_mm": self.form_95,
+            "n_points": len(self.points),
+            "n_used": self.n_used,
+            "n_effective": self.n_effective,
+            "dof": self.dof,
+            "rms_mm": self.rms,
+            "form_mm": self.form,
+            "form_95_mm": self.form_95,
             "outlier_rule": self.outlier_rule,
         }
 
@@ -146,7 +151,7 @@ def narrowest_shell(residuals: Array, share: float) -> float:
     """Width of the narrowest interval that holds `share` of the residuals, mm."""
     ordered = np.sort(residuals)
     inside = max(math.ceil(share * len(ordered)), 1)
-    return float(np.min(ordered[inside - 1:] - ordered[: len(ordered) - inside + 1]))
+    return float(np.min(ordered[inside - 1 :] - ordered[: len(ordered) - inside + 1]))
 
 
 def patch_means(feature: Feature, n: int) -> Array:

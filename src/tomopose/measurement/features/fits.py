@@ -48,7 +48,6 @@ START_DIRECTIONS, STARTS, START_POINTS = 300, 6, 1000
 MAX_OUTLIER_ROUNDS = 20
 
 
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Block:
     """One linear least-squares problem at the solution: distances d (m,) with sigma (m,), their derivatives J (m, p),
@@ -66,7 +65,11 @@ Fit = Callable[[Array, Array], tuple[Array, list[Block]]]
 
 
 def fit_plane(
-    points: Any, *, sigma: Any = None, area: Any = None, outliers: float | None = None,
+    points: Any,
+    *,
+    sigma: Any = None,
+    area: Any = None,
+    outliers: float | None = None,
     correlation_range: float = 0.0,
 ) -> Feature:
     """Plane through the weighted centroid; the normal belongs to the least singular value.
@@ -77,7 +80,11 @@ def fit_plane(
 
 
 def fit_line(
-    points: Any, *, sigma: Any = None, area: Any = None, outliers: float | None = None,
+    points: Any,
+    *,
+    sigma: Any = None,
+    area: Any = None,
+    outliers: float | None = None,
     correlation_range: float = 0.0,
 ) -> Feature:
     """Line through the weighted centroid along the greatest singular value.  Residuals are distances, not signed."""
@@ -85,7 +92,11 @@ def fit_line(
 
 
 def fit_circle(
-    points: Any, *, sigma: Any = None, area: Any = None, outliers: float | None = None,
+    points: Any,
+    *,
+    sigma: Any = None,
+    area: Any = None,
+    outliers: float | None = None,
     correlation_range: float = 0.0,
 ) -> Feature:
     """Circle in space: the plane of the points, then the circle in it.  Residuals are those in the plane."""
@@ -120,8 +131,15 @@ def fit_cylinder(
     correlation_range: float = 0.0,
 ) -> Feature:
     """Cylinder.  direction: (3,) about along the axis, where it is known; otherwise it is searched for."""
-    return _fit("cylinder", lambda x, s: _about_axis("cylinder", x, s, direction), points, sigma, area, outliers,
-                correlation_range)
+    return _fit(
+        "cylinder",
+        lambda x, s: _about_axis("cylinder", x, s, direction),
+        points,
+        sigma,
+        area,
+        outliers,
+        correlation_range,
+    )
 
 
 def fit_cone(
@@ -134,8 +152,9 @@ def fit_cone(
     correlation_range: float = 0.0,
 ) -> Feature:
     """Cone; its direction is that in which it widens.  direction: (3,) about along the axis, where it is known."""
-    return _fit("cone", lambda x, s: _about_axis("cone", x, s, direction), points, sigma, area, outliers,
-                correlation_range)
+    return _fit(
+        "cone", lambda x, s: _about_axis("cone", x, s, direction), points, sigma, area, outliers, correlation_range
+    )
 
 
 # -- the common part -------------------------------------------------------------------------------------------------
@@ -180,15 +199,19 @@ def _fit(
             break
     shares = [_covariance(b, x[used], w, correlation_range) for b in blocks]
     return Feature(
-        kind=kind, vector=vector, covariance=sum((c for c, _ in shares), np.zeros((8, 8))), points=x, used=used,
-        residuals=d, n_effective=min(i.n_effective for _, i in shares), dof=min(i.dof for _, i in shares),
+        kind=kind,
+        vector=vector,
+        covariance=sum((c for c, _ in shares), np.zeros((8, 8))),
+        points=x,
+        used=used,
+        residuals=d,
+        n_effective=min(i.n_effective for _, i in shares),
+        dof=min(i.dof for _, i in shares),
         outlier_rule="none" if outliers is None else f"{outliers:g} rms, repeated until none is left",
     )
 
 
-def _covariance(
-    block: Block, points: Array, weight: Array, correlation_range: float
-) -> tuple[Array, Independence]:
+def _covariance(block: Block, points: Array, weight: Array, correlation_range: float) -> tuple[Array, Independence]:
     """(8, 8) = T s^2 L (J' W J)^-1 T', s^2 L from the residuals; infinite where no degree of freedom is left.
 
     weight: (n,) of mean 1, that the block's sigma hold beside the points' own uncertainties."""
@@ -348,5 +371,10 @@ def _about_axis(kind: str, points: Array, sigma: Array, direction: Any) -> tuple
 
 
 def _unscaled(shape: Shape, centre: Array, scale: float) -> Shape:
-    return Shape(kind=shape.kind, point=centre + scale * shape.point, frame=shape.frame, radius=scale * shape.radius,
-                 psi=shape.psi)
+    return Shape(
+        kind=shape.kind,
+        point=centre + scale * shape.point,
+        frame=shape.frame,
+        radius=scale * shape.radius,
+        psi=shape.psi,
+    )

@@ -60,14 +60,20 @@ def distance(first: Feature, second: Feature, *, rule: Rule = "centroid-of-secon
         return _propagated(between, (first, second), "mm", direction, f"plane to plane, {rule}")
     if kinds == ("centre", "centre"):
         return _propagated(
-            lambda a, b: float(np.linalg.norm(a[:3] - b[:3])), (first, second), "mm", "unidirectional",
+            lambda a, b: float(np.linalg.norm(a[:3] - b[:3])),
+            (first, second),
+            "mm",
+            "unidirectional",
             "centre to centre",
         )
     if kinds in (("centre", "plane"), ("plane", "centre")):
         centre, plane = (first, second) if kinds[0] == "centre" else (second, first)
         return _propagated(
-            lambda a, b: abs(float((a[:3] - b[:3]) @ b[3:6])) / float(np.linalg.norm(b[3:6])), (centre, plane), "mm",
-            "one-sided", "centre to plane",
+            lambda a, b: abs(float((a[:3] - b[:3]) @ b[3:6])) / float(np.linalg.norm(b[3:6])),
+            (centre, plane),
+            "mm",
+            "one-sided",
+            "centre to plane",
         )
     if kinds in (("centre", "axis"), ("axis", "centre")):
         centre, axis = (first, second) if kinds[0] == "centre" else (second, first)
@@ -107,12 +113,21 @@ def form(feature: Feature, which: str) -> Measured:
 
     Its uncertainty is not determinable from one surface: noise adds to it on one side only.
     """
-    words = {"form": f"range of {feature.n_used} points", "form_95": f"95 % of {feature.n_used} points",
-             "form_25": "range of 25 patch means"}
+    words = {
+        "form": f"range of {feature.n_used} points",
+        "form_95": f"95 % of {feature.n_used} points",
+        "form_25": "range of 25 patch means",
+    }
     if which not in words:
         raise InputError(f"{which!r} is no form deviation; {', '.join(words)} are known")
-    return Measured(value=float(getattr(feature, which)), u=np.nan, dof=np.nan, unit="mm", direction="bidirectional",
-                    method=f"{words[which]} about the least-squares {feature.kind}; outliers: {feature.outlier_rule}")
+    return Measured(
+        value=float(getattr(feature, which)),
+        u=np.nan,
+        dof=np.nan,
+        unit="mm",
+        direction="bidirectional",
+        method=f"{words[which]} about the least-squares {feature.kind}; outliers: {feature.outlier_rule}",
+    )
 
 
 def position(feature: Feature, nominal: Any) -> Measured:
@@ -139,8 +154,12 @@ def at_reference_temperature(measured: Measured, temperature_C: float, expansion
     """A length measured at a temperature, as it is at 20 C: L / (1 + alpha (T - 20))."""
     factor = 1.0 / (1.0 + expansion_per_K * (temperature_C - REFERENCE_TEMPERATURE_C))
     return Measured(
-        value=measured.value * factor, u=measured.u * factor, dof=measured.dof, unit=measured.unit,
-        direction=measured.direction, method=f"{measured.method}; from {temperature_C:g} to 20 C",
+        value=measured.value * factor,
+        u=measured.u * factor,
+        dof=measured.dof,
+        unit=measured.unit,
+        direction=measured.direction,
+        method=f"{measured.method}; from {temperature_C:g} to 20 C",
     )
 
 
@@ -187,5 +206,6 @@ def _propagated(
     freedom = [max(f.dof, 1.0) for f in features]
     weight = sum(s**2 / d for s, d in zip(shares, freedom, strict=True))
     dof = variance**2 / weight if weight > 0 else min(freedom)
-    return Measured(value=value, u=float(np.sqrt(variance)), dof=float(dof), unit=unit, direction=direction,
-                    method=method)
+    return Measured(
+        value=value, u=float(np.sqrt(variance)), dof=float(dof), unit=unit, direction=direction, method=method
+    )

@@ -89,8 +89,11 @@ def slid(shape: Shape) -> Shape:
         return shape
     along = -float(shape.point @ shape.frame[2])
     return Shape(
-        kind=shape.kind, point=shape.point + along * shape.frame[2], frame=shape.frame,
-        radius=shape.radius + along * np.tan(shape.psi), psi=shape.psi,
+        kind=shape.kind,
+        point=shape.point + along * shape.frame[2],
+        frame=shape.frame,
+        radius=shape.radius + along * np.tan(shape.psi),
+        psi=shape.psi,
     )
 
 

@@ -189,7 +189,9 @@ def measure_sphere(
                 "safety distance smaller or the angle larger"
             )
         fit = fit_sphere(
-            surface.points[kept], area=surface.areas[kept], outliers=outliers,
+            surface.points[kept],
+            area=surface.areas[kept],
+            outliers=outliers,
             correlation_range=CORRELATION_VOXELS * float(surface.spacing.max()),
         )
         rough = fit.point
@@ -226,8 +228,9 @@ def measure_spheres(
     fits: dict[int, Feature] = {}
     for number, index in enumerate(which.index):
         if index >= 0:
-            fits[number] = measure_sphere(surface, found[index], diameter / 2, safety=safety, max_angle=max_angle,
-                                          outliers=outliers)
+            fits[number] = measure_sphere(
+                surface, found[index], diameter / 2, safety=safety, max_angle=max_angle, outliers=outliers
+            )
         if progress is not None:
             progress(number + 1, len(c))
     return fits, which

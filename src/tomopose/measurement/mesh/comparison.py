@@ -81,11 +81,18 @@ class Comparison:
     def to_json(self) -> dict[str, Any]:
         d = self.measured
         return {
-            "vertices": len(self.deviation), "measured": len(d), "on_edge": int(self.on_edge.sum()),
-            "flags": flag_counts(self.flags[~self.on_edge]), "mean_mm": float(d.mean()), "rms_mm": float(
-                np.sqrt(np.mean(d**2))), "min_mm": float(d.min()), "max_mm": float(d.max()),
-            "percentiles_mm": dict(self.percentiles()), "alignment": self.alignment.to_json(),
-            "best_fit_moved_mm": self.moved_mm, "best_fit_turned_rad": self.turned_rad,
+            "vertices": len(self.deviation),
+            "measured": len(d),
+            "on_edge": int(self.on_edge.sum()),
+            "flags": flag_counts(self.flags[~self.on_edge]),
+            "mean_mm": float(d.mean()),
+            "rms_mm": float(np.sqrt(np.mean(d**2))),
+            "min_mm": float(d.min()),
+            "max_mm": float(d.max()),
+            "percentiles_mm": dict(self.percentiles()),
+            "alignment": self.alignment.to_json(),
+            "best_fit_moved_mm": self.moved_mm,
+            "best_fit_turned_rad": self.turned_rad,
         }
 
 
@@ -118,8 +125,13 @@ def compare(
 
     def deviations(rows: np.ndarray, a: Alignment, shown: Progress | None) -> tuple[Array, np.ndarray]:
         found = probe(
-            volume, a.points(reference.points[rows]), a.directions(reference.normals[rows]), settings=settings,
-            search_mm=search_mm, contrast=found_levels.contrast, progress=shown,
+            volume,
+            a.points(reference.points[rows]),
+            a.directions(reference.normals[rows]),
+            settings=settings,
+            search_mm=search_mm,
+            contrast=found_levels.contrast,
+            progress=shown,
         )
         return found.edges.offset, found.edges.flags
 
@@ -142,8 +154,12 @@ def compare(
     deviation[chosen], all_flags[chosen] = d, flags
     centre = reference.points.mean(axis=0)
     return Comparison(
-        mesh=reference, points=final.points(reference.points), deviation=deviation, flags=all_flags,
-        on_edge=reference.on_edge, alignment=final,
+        mesh=reference,
+        points=final.points(reference.points),
+        deviation=deviation,
+        flags=all_flags,
+        on_edge=reference.on_edge,
+        alignment=final,
         moved_mm=float(np.linalg.norm(final.points(centre) - start.points(centre))),
         turned_rad=float(rotation_angle_between(final.R, start.R)),
     )

@@ -28,9 +28,11 @@ def write_comparison(comparison: Comparison, folder: str | Path, *, range_mm: fl
         (temporary / "comparison.glb").write_bytes(glb(comparison, colours))
         write_text(temporary / "comparison.vtp", vtp(comparison))
         write_text(temporary / "comparison.csv", table(comparison))
-        write_json(temporary / "comparison.json", "comparison",
-                   {**comparison.to_json(), "range_mm": range_mm,
-                    "share_within_range": comparison.share_within(range_mm)})
+        write_json(
+            temporary / "comparison.json",
+            "comparison",
+            {**comparison.to_json(), "range_mm": range_mm, "share_within_range": comparison.share_within(range_mm)},
+        )
 
 
 def ply(comparison: Comparison, colours: np.ndarray) -> bytes:
@@ -57,17 +59,29 @@ def glb(comparison: Comparison, colours: np.ndarray) -> bytes:
     c = np.column_stack([np.round(65535 * linear).astype("<u2"), np.full(len(x), 65535, dtype="<u2")])
     parts = [x.tobytes(), c.tobytes(), comparison.mesh.faces.astype("<u4").tobytes()]
     offsets = np.cumsum([0, *map(len, parts)]).tolist()
-    views = [{"buffer": 0, "byteOffset": offsets[k], "byteLength": len(parts[k]), "target": t}
-             for k, t in enumerate((34962, 34962, 34963))]
+    views = [
+        {"buffer": 0, "byteOffset": offsets[k], "byteLength": len(parts[k]), "target": t}
+        for k, t in enumerate((34962, 34962, 34963))
+    ]
     document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "tomopose"}, "scene": 0, "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}], "extensionsUsed": ["KHR_materials_unlit"],
+        "asset": {"version": "2.0", "generator": "tomopose"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "extensionsUsed": ["KHR_materials_unlit"],
         "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0}, "extensions": {"KHR_materials_unlit": {}}}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0}]}],
-        "buffers": [{"byteLength": offsets[-1]}], "bufferViews": views,
+        "buffers": [{"byteLength": offsets[-1]}],
+        "bufferViews": views,
         "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": len(x), "type": "VEC3",
-             "min": x.min(axis=0).tolist(), "max": x.max(axis=0).tolist()},
+            {
+                "bufferView": 0,
+                "componentType": 5126,
+                "count": len(x),
+                "type": "VEC3",
+                "min": x.min(axis=0).tolist(),
+                "max": x.max(axis=0).tolist(),
+            },
             {"bufferView": 1, "componentType": 5123, "normalized": True, "count": len(x), "type": "VEC4"},
             {"bufferView": 2, "componentType": 5125, "count": comparison.mesh.faces.size, "type": "SCALAR"},
         ],
@@ -77,8 +91,14 @@ def glb(comparison: Comparison, colours: np.ndarray) -> bytes:
     binary = b"".join(parts)
     binary += b"\0" * (-len(binary) % 4)
     total = 12 + 8 + len(text) + 8 + len(binary)
-    return (b"glTF" + struct.pack("<II", 2, total) + struct.pack("<I4s", len(text), b"JSON") + text
-            + struct.pack("<I4s", len(binary), b"BIN\0") + binary)
+    return (
+        b"glTF"
+        + struct.pack("<II", 2, total)
+        + struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(binary), b"BIN\0")
+        + binary
+    )
 
 
 def vtp(comparison: Comparison) -> str:
@@ -96,10 +116,10 @@ def vtp(comparison: Comparison) -> str:
         '<PointData Scalars="deviation_um">'
         f'<DataArray type="Float64" Name="deviation_um" format="binary">{block(deviation)}</DataArray></PointData>\n'
         '<Points><DataArray type="Float64" NumberOfComponents="3" format="binary">'
-        f'{block(np.ascontiguousarray(comparison.points, dtype="<f8"))}</DataArray></Points>\n'
+        f"{block(np.ascontiguousarray(comparison.points, dtype='<f8'))}</DataArray></Points>\n"
         '<Polys><DataArray type="Int64" Name="connectivity" format="binary">'
-        f'{block(comparison.mesh.faces.astype("<i8"))}</DataArray>'
+        f"{block(comparison.mesh.faces.astype('<i8'))}</DataArray>"
         '<DataArray type="Int64" Name="offsets" format="binary">'
-        f'{block(3 * np.arange(1, m + 1, dtype="<i8"))}</DataArray></Polys>\n'
+        f"{block(3 * np.arange(1, m + 1, dtype='<i8'))}</DataArray></Polys>\n"
         "</Piece></PolyData></VTKFile>\n"
     )

@@ -175,7 +175,7 @@ def _read_stl(content: bytes) -> Mesh:
     else:
         words = content.decode("ascii").split()
         rows = [k for k, w in enumerate(words) if w.lower() == "vertex"]
-        corners = np.array([[float(v) for v in words[k + 1: k + 4]] for k in rows])
+        corners = np.array([[float(v) for v in words[k + 1 : k + 4]] for k in rows])
         if len(corners) % 3 or not len(corners):
             raise ValueError(f"{len(corners)} vertices make no triangles")
     points, inverse = np.unique(corners.astype(np.float64), axis=0, return_inverse=True)
@@ -184,14 +184,29 @@ def _read_stl(content: bytes) -> Mesh:
     return Mesh(points=points, faces=faces[whole])
 
 
-PLY_TYPES = {"char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4", "float": "<f4",
-             "double": "<f8", "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4",
-             "uint32": "<u4", "float32": "<f4", "float64": "<f8"}
+PLY_TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "<i2",
+    "ushort": "<u2",
+    "int": "<i4",
+    "uint": "<u4",
+    "float": "<f4",
+    "double": "<f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "<i2",
+    "uint16": "<u2",
+    "int32": "<i4",
+    "uint32": "<u4",
+    "float32": "<f4",
+    "float64": "<f8",
+}
 
 
 def _read_ply(content: bytes) -> Mesh:
     end = content.index(b"end_header")
-    body = content[content.index(b"\n", end) + 1:]
+    body = content[content.index(b"\n", end) + 1 :]
     lines = [line.split() for line in content[:end].decode("ascii").splitlines()]
     if lines[0] != ["ply"]:
         raise ValueError("the first line is not 'ply'")
@@ -213,7 +228,7 @@ def _read_ply(content: bytes) -> Mesh:
         names = [f[0] for f in fields]
         values = np.array([[float(v) for v in row.split()] for row in rows[:n]])
         points = values[:, [names.index(c) for c in "xyz"]]
-        faces = np.array([[int(v) for v in row.split()] for row in rows[n: n + m]])
+        faces = np.array([[int(v) for v in row.split()] for row in rows[n : n + m]])
     elif kind == "binary_little_endian":
         vertex = np.dtype(fields)
         table = np.frombuffer(body, dtype=vertex, count=n)

@@ -56,11 +56,13 @@ def _divided(faces: np.ndarray, middle: np.ndarray, points: np.ndarray) -> np.nd
     # Of the two diagonals of the quadrilateral a, ab, bc, c that two halved edges leave, the shorter.
     far = np.linalg.norm(points[a] - points[bc], axis=1) <= np.linalg.norm(points[ab] - points[c], axis=1)
     by_a, by_c = two[far[two]], two[~far[two]]
-    return np.concatenate([
-        faces[count == 0],
-        *rows(one, (a, ab, c), (ab, b, c)),
-        *rows(two, (ab, b, bc)),
-        *rows(by_a, (a, ab, bc), (a, bc, c)),
-        *rows(by_c, (a, ab, c), (ab, bc, c)),
-        *rows(three, (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)),
-    ])
+    return np.concatenate(
+        [
+            faces[count == 0],
+            *rows(one, (a, ab, c), (ab, b, c)),
+            *rows(two, (ab, b, bc)),
+            *rows(by_a, (a, ab, bc), (a, bc, c)),
+            *rows(by_c, (a, ab, c), (ab, bc, c)),
+            *rows(three, (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)),
+        ]
+    )

@@ -57,8 +57,8 @@ def read_step(path: str | Path, *, deflection: float = DEFLECTION) -> Mesh:
 def _triangles(content: bytes) -> list[Array]:
     """Corners (m, 3, 3), metres, of each mesh of a binary glTF file, where its nodes place it."""
     length = struct.unpack_from("<I", content, 12)[0]
-    document = json.loads(content[20: 20 + length])
-    binary = content[20 + length + 8:]
+    document = json.loads(content[20 : 20 + length])
+    binary = content[20 + length + 8 :]
     found: list[Array] = []
 
     def visit(number: int, above: Array) -> None:

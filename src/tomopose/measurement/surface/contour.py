@@ -42,7 +42,7 @@ def contour(
     seam: tuple[Array, np.ndarray] | None = None
     for done, z_0 in enumerate(starts):
         z_1 = min(z_0 + slab_layers, n_z - 1)
-        part = np.ascontiguousarray(values[z_0: z_1 + 1], dtype=np.float32)
+        part = np.ascontiguousarray(values[z_0 : z_1 + 1], dtype=np.float32)
         x, f = _flying_edges(part, level, engine)
         x[:, 0] += z_0
         number = np.arange(total, total + len(x))

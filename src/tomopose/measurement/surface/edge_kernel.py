@@ -23,8 +23,25 @@ AGAIN = 0.3
 """Share of the contrast by which grey must come back for a second edge."""
 COARSE = 0.5
 """Distance of samples beyond the window, voxels."""
-(S, A, B, RMS, S_VARIANCE, INNER_SLOPE, OUTER_SLOPE, D_SIGMA, D_SIGMA_2, S_BY_A, S_BY_B, S_VARIANCE_HELD,
- AA, AB, BB, INSIDE, OUTSIDE) = range(17)
+(
+    S,
+    A,
+    B,
+    RMS,
+    S_VARIANCE,
+    INNER_SLOPE,
+    OUTER_SLOPE,
+    D_SIGMA,
+    D_SIGMA_2,
+    S_BY_A,
+    S_BY_B,
+    S_VARIANCE_HELD,
+    AA,
+    AB,
+    BB,
+    INSIDE,
+    OUTSIDE,
+) = range(17)
 """Columns of a result: s_0, a, b, rms of the fit, variance of s_0 for unit noise, differences of the two halves of
 each plateau, the sums that a common step in sigma is made of, by how much s_0 moves with a and b held elsewhere, and
 its variance then, the normal equations of a and b with s_0 eliminated, the mean grey levels beyond the window on both
@@ -81,11 +98,15 @@ def _steepest(c: Any, p: Any, n: Any, search: Any, window: Any) -> Any:
         fall, inside = 0.0, True
         for e in (-1.5, -1.0, -0.5, 0.5, 1.0, 1.5):
             z, y, x = p[0] + (s + e) * n[0], p[1] + (s + e) * n[1], p[2] + (s + e) * n[2]
-            if (min(z, y, x) < 1.0 or z > c.shape[0] - 2.000001 or y > c.shape[1] - 2.000001
-                    or x > c.shape[2] - 2.000001):
+            if (
+                min(z, y, x) < 1.0
+                or z > c.shape[0] - 2.000001
+                or y > c.shape[1] - 2.000001
+                or x > c.shape[2] - 2.000001
+            ):
                 inside = False
                 break
-            fall += (spline_value(c, z, y, x) if e < 0 else -spline_value(c, z, y, x))
+            fall += spline_value(c, z, y, x) if e < 0 else -spline_value(c, z, y, x)
         if inside and fall > best:
             best, where = fall, s
     return where
@@ -169,8 +190,11 @@ def _fit_edge(g: Any, sigma: Any, window: Any, start: Any, a: Any, b: Any, out: 
         q3 += (1 - phi) * slope * t / sigma
     c11, c12, c13 = h22 * h33 - h23 * h23, h13 * h23 - h12 * h33, h12 * h23 - h13 * h22
     c22, c23, c33 = h11 * h33 - h13 * h13, h12 * h13 - h11 * h23, h11 * h22 - h12 * h12
-    out[D_SIGMA_2] -= (q1 * (c11 * q1 + c12 * q2 + c13 * q3) + q2 * (c12 * q1 + c22 * q2 + c23 * q3)
-                       + q3 * (c13 * q1 + c23 * q2 + c33 * q3)) / det
+    out[D_SIGMA_2] -= (
+        q1 * (c11 * q1 + c12 * q2 + c13 * q3)
+        + q2 * (c12 * q1 + c22 * q2 + c23 * q3)
+        + q3 * (c13 * q1 + c23 * q2 + c33 * q3)
+    ) / det
     return converged
 
 
@@ -221,8 +245,12 @@ def _beyond(c: Any, p: Any, n: Any, middle: Any, sigma: Any, window: Any, longer
         for k in range(1, steps + guard + 1):
             s = middle + side * (window + k * COARSE)
             z, y, x = p[0] + s * n[0], p[1] + s * n[1], p[2] + s * n[2]
-            if (min(z, y, x) < 1.0 or z > c.shape[0] - 2.000001 or y > c.shape[1] - 2.000001
-                    or x > c.shape[2] - 2.000001):
+            if (
+                min(z, y, x) < 1.0
+                or z > c.shape[0] - 2.000001
+                or y > c.shape[1] - 2.000001
+                or x > c.shape[2] - 2.000001
+            ):
                 return
             g = spline_value(c, z, y, x)
             if k > 2 and abs((g + last + before) / 3.0 - level) > limit:

@@ -194,7 +194,7 @@ def _piece(
     high = np.minimum(np.ceil(index.max(axis=0) + reach).astype(int) + REACH + 1, volume.grid.shape)
     if (high - low < 4).any():
         return np.full((len(index), kernel.N_COLUMNS), np.nan), np.full(len(index), kernel.BORDER, dtype=np.uint8)
-    part = volume.values[low[0]: high[0], low[1]: high[1], low[2]: high[2]]
+    part = volume.values[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
     coefficients = spline_coefficients(part)
     return kernel.search_lines(
         coefficients, index - low, step, sigma, window, settings.search_distance, settings.method == "esf", longer
@@ -213,12 +213,18 @@ def _estimated_sigma(volume: Volume, index: Array, step: Array, settings: EdgeSe
     reach = (settings.search_distance + 2 * _window(settings, SIGMA_RANGE[1]) + 2) * np.abs(step).max(axis=0)
     low = np.maximum(np.floor(index[rows].min(axis=0) - reach).astype(int) - REACH, 0)
     high = np.minimum(np.ceil(index[rows].max(axis=0) + reach).astype(int) + REACH + 1, volume.grid.shape)
-    coefficients = spline_coefficients(volume.values[low[0]: high[0], low[1]: high[1], low[2]: high[2]])
+    coefficients = spline_coefficients(volume.values[low[0] : high[0], low[1] : high[1], low[2] : high[2]])
     sigma = START_SIGMA
     for _ in range(SIGMA_ROUNDS):
         result, flags = kernel.search_lines(
-            coefficients, index[rows] - low, step[rows], sigma, _window(settings, sigma), settings.search_distance,
-            True, 0.0,
+            coefficients,
+            index[rows] - low,
+            step[rows],
+            sigma,
+            _window(settings, sigma),
+            settings.search_distance,
+            True,
+            0.0,
         )
         good = flags == 0
         if not good.any():
@@ -262,13 +268,19 @@ def _lengthen(result: Array, flags: np.ndarray) -> int:
     result[rows, kernel.A] += change[:, 0]
     result[rows, kernel.B] += change[:, 1]
     result[rows, kernel.S] += by_a * change[:, 0] + by_b * change[:, 1]
-    result[rows, kernel.S_VARIANCE] = (found[:, kernel.S_VARIANCE_HELD]
-                                       + (by_a**2 * bb - 2 * by_a * by_b * ab + by_b**2 * aa) / det)
+    result[rows, kernel.S_VARIANCE] = (
+        found[:, kernel.S_VARIANCE_HELD] + (by_a**2 * bb - 2 * by_a * by_b * ab + by_b**2 * aa) / det
+    )
     return len(rows)
 
 
 def _judged(
-    result: Array, flags: np.ndarray, sigma: float, window: float, unit: float, settings: EdgeSettings,
+    result: Array,
+    flags: np.ndarray,
+    sigma: float,
+    window: float,
+    unit: float,
+    settings: EdgeSettings,
     contrast: float | None,
 ) -> Edges:
     difference = result[:, kernel.A] - result[:, kernel.B]
@@ -285,9 +297,14 @@ def _judged(
     u = result[:, kernel.RMS] * np.sqrt(result[:, kernel.S_VARIANCE] / kernel.STEP)
     bad = flags != 0
     return Edges(
-        offset=np.where(bad, np.nan, result[:, kernel.S] * unit), inside=result[:, kernel.A],
-        outside=result[:, kernel.B], residual=result[:, kernel.RMS], u=np.where(bad, np.nan, u * unit), flags=flags,
-        sigma=sigma * unit, window=window * unit,
+        offset=np.where(bad, np.nan, result[:, kernel.S] * unit),
+        inside=result[:, kernel.A],
+        outside=result[:, kernel.B],
+        residual=result[:, kernel.RMS],
+        u=np.where(bad, np.nan, u * unit),
+        flags=flags,
+        sigma=sigma * unit,
+        window=window * unit,
     )
 
 

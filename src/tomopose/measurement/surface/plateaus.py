@@ -115,6 +115,6 @@ def _trimmed_means(x: Any, n: Any, values: Any, key: Any, size: Any, radius: Any
                     k += 1
         cut = int(TRIMMED * found)
         for a in range(c):
-            mean[i, a] = np.mean(np.sort(near[a, :found])[cut: found - cut])
+            mean[i, a] = np.mean(np.sort(near[a, :found])[cut : found - cut])
         count[i] = found
     return mean, count

@@ -118,18 +118,26 @@ def surface(
     notes = (f"{dropped} pieces below {100 * smallest_share:g} % of the largest area dropped",) if dropped else ()
     n = len(points)
     start = Surface(
-        points=points, faces=faces, normals=normals, offset=np.zeros(n), contrast=np.full(n, given.contrast),
-        residual=np.full(n, np.nan), u=np.full(n, np.nan), flags=np.zeros(n, dtype=np.uint8), sigma=np.nan,
-        levels=given, spacing=volume.grid.spacing, notes=notes, settings={"method": method},
+        points=points,
+        faces=faces,
+        normals=normals,
+        offset=np.zeros(n),
+        contrast=np.full(n, given.contrast),
+        residual=np.full(n, np.nan),
+        u=np.full(n, np.nan),
+        flags=np.zeros(n, dtype=np.uint8),
+        sigma=np.nan,
+        levels=given,
+        spacing=volume.grid.spacing,
+        notes=notes,
+        settings={"method": method},
     )
     if method == "iso-50":
         if curvature_correction:
             raise InputError("the curvature correction needs the blur, which iso-50 does not know; use esf or local-50")
         return start
     settings = replace(edges or EdgeSettings(), method=method)
-    found = search_edges(
-        volume, points, normals, settings, contrast=given.contrast, layers=layers, progress=progress
-    )
+    found = search_edges(volume, points, normals, settings, contrast=given.contrast, layers=layers, progress=progress)
     return _moved(volume, start, found, settings, curvature_correction, layers)
 
 
@@ -138,9 +146,7 @@ def surfaces(volume: Volume, *, materials: int, **options: Any) -> tuple[Surface
     return tuple(surface(volume, levels=levels, **options) for levels in grey_levels(volume, materials))
 
 
-def _moved(
-    volume: Volume, start: Surface, found: Edges, settings: EdgeSettings, correct: bool, layers: int
-) -> Surface:
+def _moved(volume: Volume, start: Surface, found: Edges, settings: EdgeSettings, correct: bool, layers: int) -> Surface:
     offset = np.where(found.good, found.offset, 0.0)
     points = start.points + offset[:, None] * start.normals
     if not found.good.any():
@@ -154,12 +160,24 @@ def _moved(
     with np.errstate(divide="ignore", invalid="ignore"):
         residual = found.residual / contrast
     return replace(
-        start, points=points, offset=offset, contrast=contrast, residual=residual, u=found.u, flags=found.flags,
-        sigma=found.sigma, corrected=correct, notes=(*start.notes, _in_words(found)),
+        start,
+        points=points,
+        offset=offset,
+        contrast=contrast,
+        residual=residual,
+        u=found.u,
+        flags=found.flags,
+        sigma=found.sigma,
+        corrected=correct,
+        notes=(*start.notes, _in_words(found)),
         settings={
-            "method": settings.method, "search_distance_voxel": settings.search_distance, "window_mm": found.window,
-            "contrast_threshold": settings.contrast_threshold, "sigma_mm": found.sigma,
-            "sigma_estimated": settings.sigma is None, "curvature_correction": correct,
+            "method": settings.method,
+            "search_distance_voxel": settings.search_distance,
+            "window_mm": found.window,
+            "contrast_threshold": settings.contrast_threshold,
+            "sigma_mm": found.sigma,
+            "sigma_estimated": settings.sigma is None,
+            "curvature_correction": correct,
         },
     )
 
@@ -180,7 +198,7 @@ def _by_slab(volume: Volume, points: Array, reach: int, layers: int, function: C
         if not rows.size:
             continue
         low = max(z_0 - reach - 1, 0)
-        part = np.ascontiguousarray(volume.values[low: z_0 + layers + reach + 1], dtype=np.float32)
+        part = np.ascontiguousarray(volume.values[low : z_0 + layers + reach + 1], dtype=np.float32)
         value = function(part, index[rows] - [low, 0, 0])
         if out is None:
             out = np.full((len(points), *value.shape[1:]), np.nan)

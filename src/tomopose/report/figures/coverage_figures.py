@@ -33,12 +33,22 @@ def detector_map(calibration: Calibration, joined: Joined, observations: BallObs
     u, v = scanner.n_u - 0.5, scanner.n_v - 0.5
     data: list[dict[str, Any]] = [
         {
-            "type": "scatter", "mode": "lines", "x": [-0.5, u, u, -0.5, -0.5], "y": [-0.5, -0.5, v, v, -0.5],
-            "line": {"color": SOFT, "width": 1.5}, "hoverinfo": "skip", "showlegend": False,
+            "type": "scatter",
+            "mode": "lines",
+            "x": [-0.5, u, u, -0.5, -0.5],
+            "y": [-0.5, -0.5, v, v, -0.5],
+            "line": {"color": SOFT, "width": 1.5},
+            "hoverinfo": "skip",
+            "showlegend": False,
         },
         {
-            "type": "scatter", "mode": "markers", "x": joined.x_D[:, 0], "y": joined.x_D[:, 1], "name": "used",
-            "marker": {"size": 5.5, "color": ACCENT}, "text": joined.pose_id,
+            "type": "scatter",
+            "mode": "markers",
+            "x": joined.x_D[:, 0],
+            "y": joined.x_D[:, 1],
+            "name": "used",
+            "marker": {"size": 5.5, "color": ACCENT},
+            "text": joined.pose_id,
             "hovertemplate": "pose %{text}<br>%{x:.1f}, %{y:.1f} px<extra></extra>",
         },
     ]
@@ -50,15 +60,23 @@ def detector_map(calibration: Calibration, joined: Joined, observations: BallObs
         if rest:
             data.append(
                 {
-                    "type": "scatter", "mode": "markers", "name": "set aside", "x": observations.x_D[rest, 0],
-                    "y": observations.x_D[rest, 1], "text": [observations.pose_id[k] for k in rest],
+                    "type": "scatter",
+                    "mode": "markers",
+                    "name": "set aside",
+                    "x": observations.x_D[rest, 0],
+                    "y": observations.x_D[rest, 1],
+                    "text": [observations.pose_id[k] for k in rest],
                     "marker": {"size": 8, "symbol": "x-thin", "line": {"width": 2, "color": ALERT}},
                     "hovertemplate": "pose %{text}<br>%{x:.1f}, %{y:.1f} px<extra></extra>",
                 }
             )
     data.append(
         {
-            "type": "scatter", "mode": "markers", "x": [scanner.u_0], "y": [scanner.v_0], "name": "piercing point",
+            "type": "scatter",
+            "mode": "markers",
+            "x": [scanner.u_0],
+            "y": [scanner.v_0],
+            "name": "piercing point",
             "marker": {"size": 12, "symbol": "cross-thin", "line": {"width": 2, "color": ORANGE}},
             "hovertemplate": "piercing point<br>%{x:.2f}, %{y:.2f} px<extra></extra>",
         }
@@ -93,15 +111,20 @@ def rotation_map(joined: Joined) -> Figure | None:
         extra[f"xaxis{suffix}"] = axis(
             f"about {'xyz'[a]} / °", domain=[left, left + 0.27], anchor=f"y{suffix}", range=[-limit, limit], nticks=5
         )
-        extra[f"yaxis{suffix}"] = axis(
-            f"about {'xyz'[b]} / °", anchor=f"x{suffix}", range=[-limit, limit], nticks=5
-        )
+        extra[f"yaxis{suffix}"] = axis(f"about {'xyz'[b]} / °", anchor=f"x{suffix}", range=[-limit, limit], nticks=5)
         for name in [g for g in ROTATION_COLOURS if (groups == g).any()]:
             k = groups == name
             data.append(
                 {
-                    "type": "scatter", "mode": "markers", "name": name, "x": w[k, a], "y": w[k, b],
-                    "xaxis": f"x{suffix}", "yaxis": f"y{suffix}", "legendgroup": name, "showlegend": panel == 0,
+                    "type": "scatter",
+                    "mode": "markers",
+                    "name": name,
+                    "x": w[k, a],
+                    "y": w[k, b],
+                    "xaxis": f"x{suffix}",
+                    "yaxis": f"y{suffix}",
+                    "legendgroup": name,
+                    "showlegend": panel == 0,
                     "marker": {"size": 6, "color": ROTATION_COLOURS[name]},
                     "hovertemplate": "%{x:.3f}°, %{y:.3f}°<extra></extra>",
                 }
@@ -130,8 +153,12 @@ def table_angles(joined: Joined) -> Figure | None:
         "cure it.",
         data=[
             {
-                "type": "barpolar", "r": counts, "theta": values, "width": [9.0] * len(values),
-                "marker": {"color": ACCENT}, "hovertemplate": "%{theta}°: %{r} poses<extra></extra>",
+                "type": "barpolar",
+                "r": counts,
+                "theta": values,
+                "width": [9.0] * len(values),
+                "marker": {"color": ACCENT},
+                "hovertemplate": "%{theta}°: %{r} poses<extra></extra>",
             }
         ],
         layout=layout(
@@ -167,9 +194,18 @@ def correlation_map(calibration: Calibration) -> Figure:
         "mount and a scanner parameter they ask for more table angles.",
         data=[
             {
-                "type": "heatmap", "z": np.round(rho, 4),
-                "x": names, "y": names, "zmin": -1, "zmax": 1, "colorscale": DIVERGING, "xgap": 1, "ygap": 1,
-                "texttemplate": "%{z:.2f}" if few else "", "textfont": {"size": 10.5}, "colorbar": colour_bar("ρ"),
+                "type": "heatmap",
+                "z": np.round(rho, 4),
+                "x": names,
+                "y": names,
+                "zmin": -1,
+                "zmax": 1,
+                "colorscale": DIVERGING,
+                "xgap": 1,
+                "ygap": 1,
+                "texttemplate": "%{z:.2f}" if few else "",
+                "textfont": {"size": 10.5},
+                "colorbar": colour_bar("ρ"),
                 "hovertemplate": "%{y}, %{x}: %{z:.4f}<extra></extra>",
             }
         ],
@@ -199,8 +235,11 @@ def singular_values(calibration: Calibration) -> Figure:
         look_for=f"Their ratio is the condition number, here {calibration.observability.condition:.3g}; {words}",
         data=[
             {
-                "type": "bar", "x": np.arange(1, s.size + 1), "y": np.where(s > 0, s, np.nan),
-                "marker": {"color": ACCENT}, "hovertemplate": "%{y:.4g}<extra></extra>",
+                "type": "bar",
+                "x": np.arange(1, s.size + 1),
+                "y": np.where(s > 0, s, np.nan),
+                "marker": {"color": ACCENT},
+                "hovertemplate": "%{y:.4g}<extra></extra>",
             }
         ],
         layout=layout(
@@ -226,8 +265,13 @@ def scan_effect(scan: ProjectionMatrices) -> Figure | None:
     ):
         traces.append(
             {
-                "type": "scatter", "mode": "lines", "x": number, "y": values, "name": name,
-                "line": {"color": colour, "width": 1.8}, "hovertemplate": "view %{x}: %{y:.4~g} px<extra></extra>",
+                "type": "scatter",
+                "mode": "lines",
+                "x": number,
+                "y": values,
+                "name": name,
+                "line": {"color": colour, "width": 1.8},
+                "hovertemplate": "view %{x}: %{y:.4~g} px<extra></extra>",
             }
         )
     return Figure(

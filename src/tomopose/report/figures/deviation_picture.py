@@ -84,7 +84,14 @@ def _depth_buffer(x: Any, faces: Any, values: Any, shade: Any, depth: Any, value
 
 
 def drawn(
-    points: Array, faces: np.ndarray, normals: Array, values: Array, *, range_um: float, R: Array, px_per_mm: float,
+    points: Array,
+    faces: np.ndarray,
+    normals: Array,
+    values: Array,
+    *,
+    range_um: float,
+    R: Array,
+    px_per_mm: float,
     size_mm: tuple[float, float],
 ) -> np.ndarray:
     """(height, width, 3) uint8: a mesh, points and normals (n, 3), coloured by values (n,), um, clipped at +-range_um.
@@ -109,8 +116,18 @@ def drawn(
 
 
 def deviation_figure(
-    panels: Mapping[str, Array], points: Array, faces: np.ndarray, normals: Array, *, range_um: float, title: str,
-    meaning: str, look_for: str, azimuth_deg: float = -60.0, elevation_deg: float = 20.0, px_per_mm: float = 12.0,
+    panels: Mapping[str, Array],
+    points: Array,
+    faces: np.ndarray,
+    normals: Array,
+    *,
+    range_um: float,
+    title: str,
+    meaning: str,
+    look_for: str,
+    azimuth_deg: float = -60.0,
+    elevation_deg: float = 20.0,
+    px_per_mm: float = 12.0,
 ) -> Figure:
     """One picture of the mesh for each name -> deviations (n,), um, side by side on one colour scale."""
     R = viewpoint(azimuth_deg, elevation_deg)
@@ -118,19 +135,51 @@ def deviation_figure(
     width, height = 2.06 * np.abs(seen[:, 0]).max(), 2.06 * np.abs(seen[:, 1]).max()
     images, words = [], []
     for k, (name, values) in enumerate(panels.items()):
-        picture = drawn(points, faces, normals, neighbours_filled(values, faces), range_um=range_um, R=R,
-                        px_per_mm=px_per_mm, size_mm=(width, height))
-        images.append({"source": data_uri(colour_png(picture)), "xref": "x", "yref": "y", "x": k * width, "y": height,
-                       "sizex": width, "sizey": height, "sizing": "stretch", "layer": "below"})
+        picture = drawn(
+            points,
+            faces,
+            normals,
+            neighbours_filled(values, faces),
+            range_um=range_um,
+            R=R,
+            px_per_mm=px_per_mm,
+            size_mm=(width, height),
+        )
+        images.append(
+            {
+                "source": data_uri(colour_png(picture)),
+                "xref": "x",
+                "yref": "y",
+                "x": k * width,
+                "y": height,
+                "sizex": width,
+                "sizey": height,
+                "sizing": "stretch",
+                "layer": "below",
+            }
+        )
         words.append({"x": (k + 0.5) * width, "y": height, "text": name, "showarrow": False, "yanchor": "bottom"})
     bare: dict[str, Any] = {"visible": False, "showgrid": False, "zeroline": False}
     # A speck in the corner carries the colour bar.
-    scale = {"type": "heatmap", "x": [0, SPECK_MM], "y": [0, SPECK_MM], "z": [[0, 0], [0, 0]], "zmin": -range_um,
-             "zmax": range_um, "colorscale": vik_scale(), "colorbar": colour_bar("deviation / µm")}
+    scale = {
+        "type": "heatmap",
+        "x": [0, SPECK_MM],
+        "y": [0, SPECK_MM],
+        "z": [[0, 0], [0, 0]],
+        "zmin": -range_um,
+        "zmax": range_um,
+        "colorscale": vik_scale(),
+        "colorbar": colour_bar("deviation / µm"),
+    }
     return Figure(
-        title=title, meaning=meaning, look_for=look_for, data=[scale], height=620,
+        title=title,
+        meaning=meaning,
+        look_for=look_for,
+        data=[scale],
+        height=620,
         layout=layout(
-            images=images, annotations=words,
+            images=images,
+            annotations=words,
             xaxis=axis(range=[0, len(panels) * width], constrain="domain", **bare),
             yaxis=axis(range=[0, 1.1 * height], scaleanchor="x", constrain="domain", **bare),
         ),

@@ -46,8 +46,18 @@ def comparison_png(comparison: Comparison, *, range_mm: float, title: str = "") 
         R = viewpoint(azimuth, elevation)
         width = 2 * MARGIN * float(np.abs((x @ R.T)[:, :2]).max())
         axes = figure.add_subplot(grid[k // 2, k % 2])
-        axes.imshow(drawn(x, comparison.mesh.faces, normals, comparison.deviation * MICROMETRES_PER_MM, range_um=limit,
-                          R=R, px_per_mm=SIDE / width, size_mm=(width, width)))
+        axes.imshow(
+            drawn(
+                x,
+                comparison.mesh.faces,
+                normals,
+                comparison.deviation * MICROMETRES_PER_MM,
+                range_um=limit,
+                R=R,
+                px_per_mm=SIDE / width,
+                size_mm=(width, width),
+            )
+        )
         axes.set_title(f"from {name}", fontsize=9)
         axes.set_axis_off()
     axes = figure.add_subplot(grid[:, 2])
@@ -58,9 +68,12 @@ def comparison_png(comparison: Comparison, *, range_mm: float, title: str = "") 
     axes.set_ylim(-limit, limit)
     figure.colorbar(ScalarMappable(norm=Normalize(-limit, limit), cmap=cm.vik), ax=axes, location="left", pad=0.02)
     d = comparison.measured
-    figure.suptitle(f"{title + ': ' if title else ''}alignment {comparison.alignment.rule}, mean "
-                    f"{d.mean() * MICROMETRES_PER_MM:+.1f} µm, "
-                    f"{100 * comparison.share_within(range_mm):.1f} % within ±{limit:g} µm", fontsize=10)
+    figure.suptitle(
+        f"{title + ': ' if title else ''}alignment {comparison.alignment.rule}, mean "
+        f"{d.mean() * MICROMETRES_PER_MM:+.1f} µm, "
+        f"{100 * comparison.share_within(range_mm):.1f} % within ±{limit:g} µm",
+        fontsize=10,
+    )
     content = io.BytesIO()
     canvas.print_figure(content, format="png")
     return content.getvalue()

@@ -45,20 +45,36 @@ def quiver(calibration: Calibration, joined: Joined) -> Figure:
     key_u, key_v = low[0] - 0.02 * span, low[1] - 0.17 * span
     data: list[dict[str, Any]] = [
         {
-            "type": "scatter", "mode": "lines", "x": lines_u, "y": lines_v, "hoverinfo": "skip", "showlegend": False,
+            "type": "scatter",
+            "mode": "lines",
+            "x": lines_u,
+            "y": lines_v,
+            "hoverinfo": "skip",
+            "showlegend": False,
             "line": {"color": ACCENT, "width": 1.3},
         },
         {
-            "type": "scatter", "mode": "markers", "x": x[:, 0], "y": x[:, 1], "showlegend": False,
+            "type": "scatter",
+            "mode": "markers",
+            "x": x[:, 0],
+            "y": x[:, 1],
+            "showlegend": False,
             "marker": {"size": 4, "color": SOFT},
             "customdata": [[p, *row, d] for p, row, d in zip(joined.pose_id, r, joined.d, strict=True)],
             "hovertemplate": "pose %{customdata[0]}<br>u %{customdata[1]:.4~g} px, v %{customdata[2]:.4~g} px"
             "<br>length %{customdata[3]:.4~g} px<extra></extra>",
         },
         {
-            "type": "scatter", "mode": "lines+text", "x": [key_u, key_u + scale * unit], "y": [key_v, key_v],
-            "line": {"color": ALERT, "width": 2.5}, "text": ["", f" {unit:g} px"], "textposition": "middle right",
-            "showlegend": False, "hoverinfo": "skip", "textfont": {"color": ALERT},
+            "type": "scatter",
+            "mode": "lines+text",
+            "x": [key_u, key_u + scale * unit],
+            "y": [key_v, key_v],
+            "line": {"color": ALERT, "width": 2.5},
+            "text": ["", f" {unit:g} px"],
+            "textposition": "middle right",
+            "showlegend": False,
+            "hoverinfo": "skip",
+            "textfont": {"color": ALERT},
         },
     ]
     return Figure(
@@ -87,8 +103,12 @@ def by_pose(joined: Joined) -> Figure:
         if rows.size:
             data.append(
                 {
-                    "type": "scatter", "mode": "markers", "name": f"rotation {name}" if joined.group else "poses",
-                    "x": joined.number[rows], "y": joined.d[rows], "text": [joined.pose_id[k] for k in rows],
+                    "type": "scatter",
+                    "mode": "markers",
+                    "name": f"rotation {name}" if joined.group else "poses",
+                    "x": joined.number[rows],
+                    "y": joined.d[rows],
+                    "text": [joined.pose_id[k] for k in rows],
                     "marker": {"size": 7, "color": ROTATION_COLOURS.get(name, ACCENT), "line": {"width": 0}},
                     "hovertemplate": "pose %{text}<br>d = %{y:.4~g} px<extra></extra>",
                 }
@@ -97,8 +117,13 @@ def by_pose(joined: Joined) -> Figure:
     ends = [float(joined.number.min()), float(joined.number.max())]
     data.append(
         {
-            "type": "scatter", "mode": "lines", "x": ends, "y": [rms, rms], "name": f"d_rms = {number(rms)} px",
-            "line": {"color": SOFT, "width": 1.3, "dash": "dash"}, "hoverinfo": "skip",
+            "type": "scatter",
+            "mode": "lines",
+            "x": ends,
+            "y": [rms, rms],
+            "name": f"d_rms = {number(rms)} px",
+            "line": {"color": SOFT, "width": 1.3, "dash": "dash"},
+            "hoverinfo": "skip",
         }
     )
     return Figure(
@@ -122,7 +147,11 @@ def over_sequence(joined: Joined) -> Figure:
         values = joined.r[order, k]
         data.append(
             {
-                "type": "scatter", "mode": "markers", "name": name, "x": joined.number[order], "y": values,
+                "type": "scatter",
+                "mode": "markers",
+                "name": name,
+                "x": joined.number[order],
+                "y": values,
                 "marker": {"size": 4.5, "color": colour, "opacity": 0.55},
                 "text": [joined.pose_id[i] for i in order],
                 "hovertemplate": f"pose %{{text}}<br>{name} %{{y:.4~g}} px<extra></extra>",
@@ -131,8 +160,12 @@ def over_sequence(joined: Joined) -> Figure:
         if len(order) > width:
             data.append(
                 {
-                    "type": "scatter", "mode": "lines", "name": f"{name}, running median",
-                    "x": joined.number[order], "y": _running_median(values, width), "hoverinfo": "skip",
+                    "type": "scatter",
+                    "mode": "lines",
+                    "name": f"{name}, running median",
+                    "x": joined.number[order],
+                    "y": _running_median(values, width),
+                    "hoverinfo": "skip",
                     "line": {"color": colour, "width": 2},
                 }
             )
@@ -163,8 +196,9 @@ def by_coordinate(joined: Joined) -> Figure | None:
     columns += [(f"φ_{n} / °", angles[:, k]) for k, n in enumerate("xyz")]
     columns.append(("table α / °", np.degrees(poses.alpha)))
     time = minutes(poses.time_utc)
-    columns.append(("time / min", time) if time is not None else ("distance from pivot / mm",
-                                                                 np.linalg.norm(poses.T_MH.t, axis=1)))
+    columns.append(
+        ("time / min", time) if time is not None else ("distance from pivot / mm", np.linalg.norm(poses.T_MH.t, axis=1))
+    )
     data: list[dict[str, Any]] = []
     extra: dict[str, Any] = {}
     limit = 1.1 * float(np.abs(joined.r).max(initial=0.0)) or 1.0
@@ -174,15 +208,27 @@ def by_coordinate(joined: Joined) -> Figure | None:
         left, bottom = column * 0.255, (1 - row) * 0.56
         extra[f"xaxis{suffix}"] = axis(title, domain=[left, left + 0.225], anchor=f"y{suffix}", nticks=5)
         extra[f"yaxis{suffix}"] = axis(
-            "residual / px" if column == 0 else "", domain=[bottom, bottom + 0.42], anchor=f"x{suffix}",
-            range=[-limit, limit], nticks=5, showticklabels=column == 0,
+            "residual / px" if column == 0 else "",
+            domain=[bottom, bottom + 0.42],
+            anchor=f"x{suffix}",
+            range=[-limit, limit],
+            nticks=5,
+            showticklabels=column == 0,
         )
         for k, (name, colour) in enumerate((("u", ACCENT), ("v", ORANGE))):
             data.append(
                 {
-                    "type": "scatter", "mode": "markers", "name": name, "x": x, "y": joined.r[:, k],
-                    "xaxis": f"x{suffix}", "yaxis": f"y{suffix}", "legendgroup": name, "showlegend": panel == 0,
-                    "marker": {"size": 4, "color": colour, "opacity": 0.55}, "text": joined.pose_id,
+                    "type": "scatter",
+                    "mode": "markers",
+                    "name": name,
+                    "x": x,
+                    "y": joined.r[:, k],
+                    "xaxis": f"x{suffix}",
+                    "yaxis": f"y{suffix}",
+                    "legendgroup": name,
+                    "showlegend": panel == 0,
+                    "marker": {"size": 4, "color": colour, "opacity": 0.55},
+                    "text": joined.pose_id,
                     "hovertemplate": f"pose %{{text}}<br>{name} %{{y:.4~g}} px<extra></extra>",
                 }
             )
@@ -210,8 +256,15 @@ def rotation_table(calibration: Calibration, joined: Joined) -> Table | None:
         rms = float(np.sqrt(np.mean(joined.d[k] ** 2)))
         mean = joined.r[k].mean(axis=0)
         rows.append(
-            [name, int(k.sum()), f"{rms:.{k_px}f}", f"{rms * to_um:.{k_um}f}", f"{joined.d[k].max():.{k_px}f}",
-             f"{mean[0]:+.{k_px}f}", f"{mean[1]:+.{k_px}f}"]
+            [
+                name,
+                int(k.sum()),
+                f"{rms:.{k_px}f}",
+                f"{rms * to_um:.{k_um}f}",
+                f"{joined.d[k].max():.{k_px}f}",
+                f"{mean[0]:+.{k_px}f}",
+                f"{mean[1]:+.{k_px}f}",
+            ]
         )
     return Table(
         title="Residuals by rotation axis",
@@ -237,13 +290,22 @@ def histogram(joined: Joined) -> Figure:
         look_for="A histogram wider than the line means that the residuals hold more than detection noise.",
         data=[
             {
-                "type": "bar", "x": (edges[1:] + edges[:-1]) / 2, "y": counts, "width": edges[1] - edges[0],
-                "marker": {"color": "#9dbfdd", "line": {"color": "#ffffff", "width": 0.6}}, "name": "residuals",
+                "type": "bar",
+                "x": (edges[1:] + edges[:-1]) / 2,
+                "y": counts,
+                "width": edges[1] - edges[0],
+                "marker": {"color": "#9dbfdd", "line": {"color": "#ffffff", "width": 0.6}},
+                "name": "residuals",
                 "hovertemplate": "%{x:.2f}: %{y:.3f}<extra></extra>",
             },
             {
-                "type": "scatter", "mode": "lines", "x": x, "y": np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi),
-                "line": {"color": ALERT, "width": 2}, "name": "normal law", "hoverinfo": "skip",
+                "type": "scatter",
+                "mode": "lines",
+                "x": x,
+                "y": np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi),
+                "line": {"color": ALERT, "width": 2},
+                "name": "normal law",
+                "hoverinfo": "skip",
             },
         ],
         layout=layout(xaxis=axis("residual / σ"), yaxis=axis("density"), bargap=0),
@@ -264,17 +326,25 @@ def quantiles(joined: Joined) -> Figure:
         "ends: outliers.",
         data=[
             {
-                "type": "scatter", "mode": "lines", "x": [-end, end], "y": [-end, end], "hoverinfo": "skip",
-                "line": {"color": LINE, "width": 2}, "showlegend": False,
+                "type": "scatter",
+                "mode": "lines",
+                "x": [-end, end],
+                "y": [-end, end],
+                "hoverinfo": "skip",
+                "line": {"color": LINE, "width": 2},
+                "showlegend": False,
             },
             {
-                "type": "scatter", "mode": "markers", "x": q, "y": z, "marker": {"size": 4.5, "color": ACCENT},
-                "hovertemplate": "expected %{x:.2f}, found %{y:.2f}<extra></extra>", "showlegend": False,
+                "type": "scatter",
+                "mode": "markers",
+                "x": q,
+                "y": z,
+                "marker": {"size": 4.5, "color": ACCENT},
+                "hovertemplate": "expected %{x:.2f}, found %{y:.2f}<extra></extra>",
+                "showlegend": False,
             },
         ],
-        layout=layout(
-            xaxis=axis("expected / σ"), yaxis=axis("found / σ"), showlegend=False
-        ),
+        layout=layout(xaxis=axis("expected / σ"), yaxis=axis("found / σ"), showlegend=False),
         height=340,
         wide=False,
     )

@@ -24,16 +24,29 @@ NEAR_CAMERA = {"eye": {"x": 0.3, "y": -1.55, "z": 0.55}, "center": {"x": 0, "y":
 def _line(points: Any, colour: str, name: str = "", *, width: float = 3, dash: str = "solid") -> dict[str, Any]:
     x = np.asarray(points, dtype=np.float64)
     return {
-        "type": "scatter3d", "mode": "lines", "x": x[:, 0], "y": x[:, 1], "z": x[:, 2], "name": name,
-        "showlegend": bool(name), "hoverinfo": "skip", "line": {"color": colour, "width": width, "dash": dash},
+        "type": "scatter3d",
+        "mode": "lines",
+        "x": x[:, 0],
+        "y": x[:, 1],
+        "z": x[:, 2],
+        "name": name,
+        "showlegend": bool(name),
+        "hoverinfo": "skip",
+        "line": {"color": colour, "width": width, "dash": dash},
     }
 
 
 def _points(points: Any, name: str, **marker: Any) -> dict[str, Any]:
     x = np.atleast_2d(np.asarray(points, dtype=np.float64))
     return {
-        "type": "scatter3d", "mode": "markers", "x": x[:, 0], "y": x[:, 1], "z": x[:, 2], "name": name,
-        "marker": marker, "hovertemplate": f"{name}<br>%{{x:.3f}}, %{{y:.3f}}, %{{z:.3f}} mm<extra></extra>",
+        "type": "scatter3d",
+        "mode": "markers",
+        "x": x[:, 0],
+        "y": x[:, 1],
+        "z": x[:, 2],
+        "name": name,
+        "marker": marker,
+        "hovertemplate": f"{name}<br>%{{x:.3f}}, %{{y:.3f}}, %{{z:.3f}} mm<extra></extra>",
     }
 
 
@@ -51,8 +64,13 @@ def _triad(frame: RigidTransform, length: float, name: str) -> list[dict[str, An
 
 def _scene(**changes: Any) -> dict[str, Any]:
     scene = {
-        "xaxis": space_axis("x / mm"), "yaxis": space_axis("y / mm"), "zaxis": space_axis("z / mm"),
-        "aspectmode": "data", "camera": CAMERA, "dragmode": "turntable", **changes,
+        "xaxis": space_axis("x / mm"),
+        "yaxis": space_axis("y / mm"),
+        "zaxis": space_axis("z / mm"),
+        "aspectmode": "data",
+        "camera": CAMERA,
+        "dragmode": "turntable",
+        **changes,
     }
     return layout(scene=scene, margin={"l": 0, "r": 0, "t": 30, "b": 0})
 
@@ -91,8 +109,17 @@ def scanner_scene(calibration: Calibration, joined: Joined) -> Figure:
     data = [
         _points(source, "source", size=5, color=ORANGE),
         {
-            "type": "mesh3d", "x": corners[:4, 0], "y": corners[:4, 1], "z": corners[:4, 2], "i": [0, 0], "j": [1, 2],
-            "k": [2, 3], "color": "#9dbfdd", "opacity": 0.45, "name": "detector", "showlegend": True,
+            "type": "mesh3d",
+            "x": corners[:4, 0],
+            "y": corners[:4, 1],
+            "z": corners[:4, 2],
+            "i": [0, 0],
+            "j": [1, 2],
+            "k": [2, 3],
+            "color": "#9dbfdd",
+            "opacity": 0.45,
+            "name": "detector",
+            "showlegend": True,
             "hoverinfo": "skip",
         },
         _line(corners, ACCENT, width=3),
@@ -121,7 +148,12 @@ def ball_scene(calibration: Calibration, joined: Joined) -> Figure | None:
     frame = manipulator_in_world(calibration)
     span = float(max(np.ptp(np.vstack([ball, frame.t[None]]), axis=0).max(), 1.0))
     dots = _points(
-        ball, "ball", size=4.5, color=joined.d, colorscale=SEQUENTIAL, showscale=True,
+        ball,
+        "ball",
+        size=4.5,
+        color=joined.d,
+        colorscale=SEQUENTIAL,
+        showscale=True,
         colorbar=colour_bar("d / px", len=0.7),
     )
     dots["text"] = joined.pose_id
@@ -148,7 +180,12 @@ def source_path(scan: ProjectionMatrices) -> Figure:
     turn = np.linspace(0, 2 * np.pi, 181)
     circle = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), np.zeros_like(turn)])
     path = _points(
-        source, "source", size=3, color=np.arange(1, len(source) + 1), colorscale=SEQUENTIAL, showscale=True,
+        source,
+        "source",
+        size=3,
+        color=np.arange(1, len(source) + 1),
+        colorscale=SEQUENTIAL,
+        showscale=True,
         colorbar=colour_bar("view", len=0.7),
     )
     path.update(mode="lines+markers", line={"color": "#b9c6d3", "width": 2})

@@ -95,8 +95,12 @@ def calibration_report(
 
 
 def _data_sections(
-    calibration: Calibration, *, observations: BallObservations | None, poses: PoseSequence | None,
-    thumbnails: Sequence[Thumbnail], scan: ProjectionMatrices | None,
+    calibration: Calibration,
+    *,
+    observations: BallObservations | None,
+    poses: PoseSequence | None,
+    thumbnails: Sequence[Thumbnail],
+    scan: ProjectionMatrices | None,
 ) -> list[Section]:
     """What rests on residuals; a calibration that failed before it had any says so."""
     if not calibration.pose_id:
@@ -148,7 +152,8 @@ def _key_figures(calibration: Calibration, scan: ProjectionMatrices | None) -> l
         pitch = np.sqrt(scan.p_u * scan.p_v) * 1000.0 / calibration.scanner.magnification
         keys.append(
             KeyFigure(
-                name="Expected effect on the scan", value=f"{number(sigma)} px",
+                name="Expected effect on the scan",
+                value=f"{number(sigma)} px",
                 note=f"{number(sigma * pitch)} µm at the object, rms",
             )
         )
@@ -224,15 +229,31 @@ def _pose_table(joined: Joined, observations: BallObservations | None) -> Table:
     for k in np.argsort(-joined.d, kind="stable"):
         pose = joined.pose_id[k]
         rows.append(
-            [pose, joined.group[k] if joined.group else "–", f"{joined.x_D[k, 0]:.4f}", f"{joined.x_D[k, 1]:.4f}",
-             f"{joined.r[k, 0]:+.{k_px}f}", f"{joined.r[k, 1]:+.{k_px}f}", f"{joined.d[k]:.{k_px}f}",
-             f"{np.linalg.norm(joined.z[k]):.2f}", number(snr[pose]) if np.isfinite(snr.get(pose, np.nan)) else "–"]
+            [
+                pose,
+                joined.group[k] if joined.group else "–",
+                f"{joined.x_D[k, 0]:.4f}",
+                f"{joined.x_D[k, 1]:.4f}",
+                f"{joined.r[k, 0]:+.{k_px}f}",
+                f"{joined.r[k, 1]:+.{k_px}f}",
+                f"{joined.d[k]:.{k_px}f}",
+                f"{np.linalg.norm(joined.z[k]):.2f}",
+                number(snr[pose]) if np.isfinite(snr.get(pose, np.nan)) else "–",
+            ]
         )
     return Table(
         title="All poses used, worst first",
         meaning="A click on a column's head sorts by it.",
         columns=[
-            "pose", "rotation", "u / px", "v / px", "residual u / px", "residual v / px", "d / px", "d / σ", "SNR",
+            "pose",
+            "rotation",
+            "u / px",
+            "v / px",
+            "residual u / px",
+            "residual v / px",
+            "d / px",
+            "d / σ",
+            "SNR",
         ],
         rows=rows,
         numeric=range(2, 9),
@@ -248,13 +269,15 @@ def _coverage(calibration: Calibration, joined: Joined, observations: BallObserv
     ]
     if joined.poses is None:
         blocks.append(Words(paragraphs=[f"Rotations and table angles: {NOT_GIVEN} (no pose table)."], wide=False))
-    return Section(title="Coverage", lead="Where in the machine the model was tested.",
-                   blocks=[b for b in blocks if b is not None])
+    return Section(
+        title="Coverage", lead="Where in the machine the model was tested.", blocks=[b for b in blocks if b is not None]
+    )
 
 
 def _scene(calibration: Calibration, joined: Joined, scan: ProjectionMatrices | None) -> Section:
     blocks: list[Block | None] = [
-        scene_figures.scanner_scene(calibration, joined), scene_figures.ball_scene(calibration, joined)
+        scene_figures.scanner_scene(calibration, joined),
+        scene_figures.ball_scene(calibration, joined),
     ]
     if scan is None:
         words = f"Path of the source and expected effect: {NOT_GIVEN} (no scan)."
@@ -262,7 +285,13 @@ def _scene(calibration: Calibration, joined: Joined, scan: ProjectionMatrices | 
     else:
         blocks += [scene_figures.source_path(scan), coverage_figures.scan_effect(scan)]
         if scan.points_sigma is None:
-            blocks.append(Words(paragraphs=[f"Expected effect on the scan: {NOT_DETERMINABLE}, the matrices hold no "
-                                            "uncertainty."]))
-    return Section(title="In space", lead="The geometry as calibrated; drag to turn, scroll to come nearer.",
-                   blocks=[b for b in blocks if b is not None])
+            blocks.append(
+                Words(
+                    paragraphs=[f"Expected effect on the scan: {NOT_DETERMINABLE}, the matrices hold no uncertainty."]
+                )
+            )
+    return Section(
+        title="In space",
+        lead="The geometry as calibrated; drag to turn, scroll to come nearer.",
+        blocks=[b for b in blocks if b is not None],
+    )

@@ -25,7 +25,14 @@ MODEL_HEADINGS: Mapping[str, str] = MappingProxyType(
     }
 )
 KNOWN = (
-    "integrity", "models", "model_chosen", "by_rotation", "pose_noise", "widening", "expected_residual_px", "not_seen",
+    "integrity",
+    "models",
+    "model_chosen",
+    "by_rotation",
+    "pose_noise",
+    "widening",
+    "expected_residual_px",
+    "not_seen",
 )
 
 
@@ -81,14 +88,19 @@ def models_by_rotation(rows: Sequence[Mapping[str, Any]]) -> Figure:
         look_for="A model that explains the manipulator brings all bars to the height of those without rotation.",
         data=[
             {
-                "type": "bar", "name": name, "x": rotations, "y": [row.get(f"{name}_px") for row in rows],
+                "type": "bar",
+                "name": name,
+                "x": rotations,
+                "y": [row.get(f"{name}_px") for row in rows],
                 "marker": {"color": MODEL_COLOURS.get(name, SOFT)},
                 "hovertemplate": f"{name}, rotation %{{x}}: %{{y:.4f}} px<extra></extra>",
             }
             for name in names
         ],
         layout=layout(
-            xaxis=axis("rotation", type="category"), yaxis=axis("d_rms / px", rangemode="tozero"), barmode="group",
+            xaxis=axis("rotation", type="category"),
+            yaxis=axis("d_rms / px", rangemode="tozero"),
+            barmode="group",
             bargap=0.35,
         ),
         height=330,
@@ -111,8 +123,13 @@ def _integrity(found: Mapping[str, Any]) -> list[Block]:
                 meaning="Drift and steps, with the probability that chance alone makes one as large.",
                 columns=["effect", "what it would be", "size / px", "probability by chance", "at pose"],
                 rows=[
-                    [e.get("name", ""), e.get("words", ""), cell(e.get("size_px")), probability(e.get("p")),
-                     e.get("at") or "–"]
+                    [
+                        e.get("name", ""),
+                        e.get("words", ""),
+                        cell(e.get("size_px")),
+                        probability(e.get("p")),
+                        e.get("at") or "–",
+                    ]
                     for e in effects
                 ],
                 numeric=(2, 3),
@@ -123,8 +140,10 @@ def _integrity(found: Mapping[str, Any]) -> list[Block]:
         columns = list(dict.fromkeys(key for row in repeats for key in row))
         blocks.append(
             Table(
-                title="Poses taken twice", meaning="How far the ball's centre came back to where it had been.",
-                columns=[heading(c) for c in columns], rows=[[cell(r.get(c)) for c in columns] for r in repeats],
+                title="Poses taken twice",
+                meaning="How far the ball's centre came back to where it had been.",
+                columns=[heading(c) for c in columns],
+                rows=[[cell(r.get(c)) for c in columns] for r in repeats],
                 folded=len(repeats) > 12,
             )
         )
@@ -163,8 +182,11 @@ def _plain(key: str, value: Any) -> Table | None:
         return None
     columns = list(dict.fromkeys(c for row in rows for c in row))
     return Table(
-        title=heading(key).capitalize(), meaning="", columns=[heading(c) for c in columns],
-        rows=[[cell(row.get(c)) for c in columns] for row in rows], folded=len(rows) > 20,
+        title=heading(key).capitalize(),
+        meaning="",
+        columns=[heading(c) for c in columns],
+        rows=[[cell(row.get(c)) for c in columns] for row in rows],
+        folded=len(rows) > 20,
     )
 
 

@@ -20,7 +20,9 @@ CHARTED = ("d_rms_px", "t_HT_x", "t_HT_y", "t_HT_z", "phi_HT_x", "phi_HT_y", "ph
 FEWEST_ENTRIES = 3
 COVERAGE_FACTOR = 2.0
 SCALES: Mapping[str, tuple[float, str]] = {
-    "mm": (MICROMETRES_PER_MM, "µm"), "rad": (MICRORADIANS_PER_RAD, "µrad"), "px": (1.0, "px"),
+    "mm": (MICROMETRES_PER_MM, "µm"),
+    "rad": (MICRORADIANS_PER_RAD, "µrad"),
+    "px": (1.0, "px"),
 }
 
 
@@ -39,8 +41,15 @@ def comparison_report(
     ):
         unit = units.get(name.split("_")[0].split("[")[0], "")
         rows.append(
-            [name, meaning(name), signed(d, unit), small_unit(u, unit), small_unit(COVERAGE_FACTOR * u, unit),
-             f"{z:+.2f}", probability(p)]
+            [
+                name,
+                meaning(name),
+                signed(d, unit),
+                small_unit(u, unit),
+                small_unit(COVERAGE_FACTOR * u, unit),
+                f"{z:+.2f}",
+                probability(p),
+            ]
         )
     figure = Figure(
         title="Changes in units of their standard uncertainty",
@@ -48,15 +57,27 @@ def comparison_report(
         look_for="Most bars should end between the lines; t_HT and t may leave them together, and cancel in the scan.",
         data=[
             {
-                "type": "bar", "x": [symbol(n) for n in comparison.names], "y": comparison.z,
-                "marker": {"color": ACCENT}, "hovertemplate": "%{x}: %{y:.2f}<extra></extra>",
+                "type": "bar",
+                "x": [symbol(n) for n in comparison.names],
+                "y": comparison.z,
+                "marker": {"color": ACCENT},
+                "hovertemplate": "%{x}: %{y:.2f}<extra></extra>",
             }
         ],
         layout=layout(
-            xaxis=axis(type="category"), yaxis=axis("change / u"), bargap=0.5,
+            xaxis=axis(type="category"),
+            yaxis=axis("change / u"),
+            bargap=0.5,
             shapes=[
-                {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": y, "y1": y,
-                 "line": {"color": SOFT, "dash": "dash", "width": 1}}
+                {
+                    "type": "line",
+                    "xref": "paper",
+                    "x0": 0,
+                    "x1": 1,
+                    "y0": y,
+                    "y1": y,
+                    "line": {"color": SOFT, "dash": "dash", "width": 1},
+                }
                 for y in (-COVERAGE_FACTOR, COVERAGE_FACTOR)
             ],
         ),
@@ -66,7 +87,8 @@ def comparison_report(
         title="Changes",
         meaning=f"{labels[1]} minus {labels[0]}, the two taken as independent.",
         columns=["coordinate", "what it is", "change", "u", "U (k = 2)", "change / u", "probability by chance"],
-        rows=rows, numeric=(2, 3, 4, 5, 6),
+        rows=rows,
+        numeric=(2, 3, 4, 5, 6),
     )
     verdict = Verdict(
         word="Changed" if changed else "Unchanged",
@@ -75,8 +97,13 @@ def comparison_report(
         reasons=comparison.words,
     )
     return render(
-        Page(title=title, subtitle=f"{labels[0]} → {labels[1]}", verdict=verdict,
-             sections=[Section(title="What changed", blocks=[table, figure])], footer="Written by tomopose.")
+        Page(
+            title=title,
+            subtitle=f"{labels[0]} → {labels[1]}",
+            verdict=verdict,
+            sections=[Section(title="What changed", blocks=[table, figure])],
+            footer="Written by tomopose.",
+        )
     )
 
 
@@ -109,14 +136,34 @@ def chart_figure(chart: ControlChart) -> Figure:
     beyond = int(np.sum(chart.out))
     trend = f"trend by chance: {probability(chart.trend_p)}"
     lines = [
-        {"type": "scatter", "mode": "lines", "x": x, "y": factor * (limit - base), "showlegend": False,
-         "line": {"color": SOFT, "width": 1, "dash": "dash", "shape": "hvh"}, "hoverinfo": "skip"}
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "x": x,
+            "y": factor * (limit - base),
+            "showlegend": False,
+            "line": {"color": SOFT, "width": 1, "dash": "dash", "shape": "hvh"},
+            "hoverinfo": "skip",
+        }
         for limit in (chart.low, chart.high)
     ]
-    bars = None if chart.name == "d_rms_px" else {
-        "type": "data", "array": COVERAGE_FACTOR * factor * chart.u, "thickness": 1.2, "width": 3, "color": ACCENT}
+    bars = (
+        None
+        if chart.name == "d_rms_px"
+        else {
+            "type": "data",
+            "array": COVERAGE_FACTOR * factor * chart.u,
+            "thickness": 1.2,
+            "width": 3,
+            "color": ACCENT,
+        }
+    )
     points: dict[str, Any] = {
-        "type": "scatter", "mode": "lines+markers", "x": x, "y": y, "showlegend": False,
+        "type": "scatter",
+        "mode": "lines+markers",
+        "x": x,
+        "y": y,
+        "showlegend": False,
         "line": {"color": LINE, "width": 1.2},
         "marker": {"size": 7, "color": [ALERT if out else ACCENT for out in chart.out]},
         "hovertemplate": f"%{{x}}<br>%{{y:.4g}} {unit}<extra></extra>",
@@ -150,8 +197,15 @@ def history_report(entries: Sequence[Mapping[str, Any]], *, title: str = "Calibr
         meaning="",
         columns=["time (UTC)", "label", "verdict", "model", "poses", "d_rms / px", "χ²/dof"],
         rows=[
-            [e["time_utc"], e.get("label") or "–", e["verdict"], e["model"], e["n_poses"], number(e["d_rms_px"]),
-             number(e["chi2_dof"])]
+            [
+                e["time_utc"],
+                e.get("label") or "–",
+                e["verdict"],
+                e["model"],
+                e["n_poses"],
+                number(e["d_rms_px"]),
+                number(e["chi2_dof"]),
+            ]
             for e in entries
         ],
         numeric=(4, 5, 6),

@@ -22,8 +22,11 @@ def observability_section(calibration: Calibration) -> Section:
         lead = "Some directions of the parameters are not held by these poses."
     else:
         blocks.append(
-            Words(title="Directions that these poses cannot tell", paragraphs=["None among the parameters solved for."],
-                  wide=False)
+            Words(
+                title="Directions that these poses cannot tell",
+                paragraphs=["None among the parameters solved for."],
+                wide=False,
+            )
         )
         lead = "All parameters solved for are held by these poses."
     if seen.notes:
@@ -59,7 +62,9 @@ def _hypotheses(hypotheses: Sequence[Mapping[str, Any]]) -> list[Block]:
         if rows:
             tables.append(
                 Table(
-                    title=title, meaning=words, columns=[heading(c) for c in columns],
+                    title=title,
+                    meaning=words,
+                    columns=[heading(c) for c in columns],
                     rows=[[_hypothesis_cell(c, row.get(c)) for c in columns] for row in rows],
                     folded=rows is excluded,
                 )

@@ -50,7 +50,9 @@ def observations_report(
         blocks += [_positions(observations), _sigmas(observations)]
     blocks.append(
         Table(
-            title="Not used", meaning="Images without a measured ball, and why.", columns=["pose", "image", "status"],
+            title="Not used",
+            meaning="Images without a measured ball, and why.",
+            columns=["pose", "image", "status"],
             rows=[
                 [pose, observations.image[k] if observations.image else "–", _status(observations, k)]
                 for k, pose in enumerate(observations.pose_id)
@@ -65,7 +67,8 @@ def observations_report(
             Pictures(
                 title="Detections as pictures",
                 meaning="Crops with the silhouette that was found (orange) and the projected centre (blue).",
-                look_for="The line should follow the ball's rim all round.", thumbnails=thumbnails,
+                look_for="The line should follow the ball's rim all round.",
+                thumbnails=thumbnails,
             )
         )
     return render(
@@ -74,8 +77,11 @@ def observations_report(
             subtitle=f"{n} images",
             verdict=_detection_verdict(n, seen),
             key_figures=_detection_keys(observations),
-            sections=[Section(title="Detections", blocks=blocks), _all_rows(observations),
-                      provenance_section(provenance)],
+            sections=[
+                Section(title="Detections", blocks=blocks),
+                _all_rows(observations),
+                provenance_section(provenance),
+            ],
             footer="Written by tomopose.",
         )
     )
@@ -101,7 +107,8 @@ def _detection_keys(observations: BallObservations) -> list[KeyFigure]:
     return [
         KeyFigure(name="Images with a ball", value=f"{int(observations.seen.sum())} of {len(observations)}"),
         KeyFigure(
-            name="Standard uncertainty", note="median of u and v",
+            name="Standard uncertainty",
+            note="median of u and v",
             value=f"{number(np.median(sigma))} px" if sigma.size else NOT_DETERMINABLE,
         ),
         KeyFigure(name="SNR", value=middle, note="median"),
@@ -116,7 +123,11 @@ def _positions(observations: BallObservations) -> Figure:
         look_for="A regular plan gives a regular pattern; a point out of line is a wrong ball or a wrong pairing.",
         data=[
             {
-                "type": "scatter", "mode": "markers", "x": x[:, 0], "y": x[:, 1], "text": observations.used.pose_id,
+                "type": "scatter",
+                "mode": "markers",
+                "x": x[:, 0],
+                "y": x[:, 1],
+                "text": observations.used.pose_id,
                 "marker": {"size": 5.5, "color": ACCENT},
                 "hovertemplate": "pose %{text}<br>%{x:.2f}, %{y:.2f} px<extra></extra>",
             }
@@ -140,8 +151,13 @@ def _sigmas(observations: BallObservations) -> Figure:
         look_for="It should be level; a rising line is a failing exposure or a source that drifts out of focus.",
         data=[
             {
-                "type": "scatter", "mode": "markers", "name": name, "x": order, "y": sigma[:, k],
-                "marker": {"size": 5, "color": colour}, "text": observations.pose_id,
+                "type": "scatter",
+                "mode": "markers",
+                "name": name,
+                "x": order,
+                "y": sigma[:, k],
+                "marker": {"size": 5, "color": colour},
+                "text": observations.pose_id,
                 "hovertemplate": f"pose %{{text}}<br>{name} %{{y:.5f}} px<extra></extra>",
             }
             for k, (name, colour) in enumerate((("u", ACCENT), ("v", ORANGE)))
@@ -155,15 +171,27 @@ def _sigmas(observations: BallObservations) -> Figure:
 def _all_rows(observations: BallObservations) -> Section:
     sigma = observations.sigma
     rows = [
-        [p, f"{observations.x_D[k, 0]:.4f}", f"{observations.x_D[k, 1]:.4f}", number(sigma[k, 0]), number(sigma[k, 1]),
-         _status(observations, k)]
+        [
+            p,
+            f"{observations.x_D[k, 0]:.4f}",
+            f"{observations.x_D[k, 1]:.4f}",
+            number(sigma[k, 0]),
+            number(sigma[k, 1]),
+            _status(observations, k),
+        ]
         for k, p in enumerate(observations.pose_id)
     ]
     return Section(
         title="All images",
         blocks=[
-            Table(title="Rows", meaning="A click on a column's head sorts by it.", folded=True, numeric=(1, 2, 3, 4),
-                  columns=["pose", "u / px", "v / px", "σ_u / px", "σ_v / px", "status"], rows=rows)
+            Table(
+                title="Rows",
+                meaning="A click on a column's head sorts by it.",
+                folded=True,
+                numeric=(1, 2, 3, 4),
+                columns=["pose", "u / px", "v / px", "σ_u / px", "σ_v / px", "status"],
+                rows=rows,
+            )
         ],
     )
 
@@ -183,22 +211,42 @@ def matrices_report(
     number_of_view = np.arange(1, len(matrices) + 1)
     effect = scan_effect(matrices)
     blocks: list[Block] = [source_path(matrices)]
-    blocks.append(effect if effect is not None else Words(
-        title="Expected effect on the scan", paragraphs=[f"{NOT_DETERMINABLE}: the matrices hold no uncertainty."],
-        wide=False))
+    blocks.append(
+        effect
+        if effect is not None
+        else Words(
+            title="Expected effect on the scan",
+            paragraphs=[f"{NOT_DETERMINABLE}: the matrices hold no uncertainty."],
+            wide=False,
+        )
+    )
     blocks.append(
         Figure(
             title="Distance of the source by view",
             meaning="Distance of the source from the origin of W, and its height above the plane of the table.",
             look_for="A tilted scan changes the height smoothly; a jump is a missing or exchanged pose.",
             data=[
-                {"type": "scatter", "mode": "lines", "name": "distance", "x": number_of_view,
-                 "y": np.linalg.norm(view.source, axis=1), "line": {"color": ACCENT, "width": 1.8}},
-                {"type": "scatter", "mode": "lines", "name": "height (right scale)", "x": number_of_view,
-                 "y": view.source[:, 2], "yaxis": "y2", "line": {"color": ALERT, "width": 1.8}},
+                {
+                    "type": "scatter",
+                    "mode": "lines",
+                    "name": "distance",
+                    "x": number_of_view,
+                    "y": np.linalg.norm(view.source, axis=1),
+                    "line": {"color": ACCENT, "width": 1.8},
+                },
+                {
+                    "type": "scatter",
+                    "mode": "lines",
+                    "name": "height (right scale)",
+                    "x": number_of_view,
+                    "y": view.source[:, 2],
+                    "yaxis": "y2",
+                    "line": {"color": ALERT, "width": 1.8},
+                },
             ],
             layout=layout(
-                xaxis=axis("view"), yaxis=axis("distance / mm"),
+                xaxis=axis("view"),
+                yaxis=axis("distance / mm"),
                 yaxis2=axis("height / mm", overlaying="y", side="right", showgrid=False),
             ),
             height=340,
@@ -214,10 +262,15 @@ def matrices_report(
             key_figures=[
                 KeyFigure(name="Views", value=str(len(matrices))),
                 KeyFigure(name="d_SD", value=f"{np.median(view.d_SD):.3f} mm", note="median"),
-                KeyFigure(name="Source to object", value=f"{np.median(np.linalg.norm(view.source, axis=1)):.3f} mm",
-                          note="median"),
-                KeyFigure(name="Height of the source",
-                          value=f"{view.source[:, 2].min():.1f} … {view.source[:, 2].max():.1f} mm"),
+                KeyFigure(
+                    name="Source to object",
+                    value=f"{np.median(np.linalg.norm(view.source, axis=1)):.3f} mm",
+                    note="median",
+                ),
+                KeyFigure(
+                    name="Height of the source",
+                    value=f"{view.source[:, 2].min():.1f} … {view.source[:, 2].max():.1f} mm",
+                ),
             ],
             sections=[Section(title="The scan", blocks=blocks), provenance_section(provenance)],
             footer="Written by tomopose. P is that of eq. (5): points of W, object at home, to pixels.",

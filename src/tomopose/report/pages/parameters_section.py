@@ -38,7 +38,8 @@ def parameters_section(calibration: Calibration) -> Section:
     if errors:
         blocks.append(
             _parameter_table(
-                errors, title="Identified errors of the manipulator",
+                errors,
+                title="Identified errors of the manipulator",
                 words="What the model found beside the mount, as corrections of the machine's stated geometry. Errors "
                 "that the poses cannot tell stay near zero with the uncertainty of their prior.",
             )
@@ -57,7 +58,8 @@ def parameters_section(calibration: Calibration) -> Section:
     )
     carried = moving_scanner(calibration.manipulator) or calibration.manipulator.get("kind") == "twin"
     lead = (
-        "How the scanner sits on the moved plate, and where the ball stands." if carried
+        "How the scanner sits on the moved plate, and where the ball stands."
+        if carried
         else "How the manipulator sits on the table, and where the ball is."
     )
     return Section(title="What was found", lead=lead, blocks=blocks)
@@ -68,12 +70,22 @@ def _parameter_table(parameters: Sequence[Parameter], *, title: str, words: str)
     for p in parameters:
         degrees = f"{np.degrees(p.value):.6f}°" if p.unit == "rad" else ""
         rows.append(
-            [p.name, meaning(p.name), value_with_uncertainty(p.value, p.u, p.unit), degrees, small_unit(p.u, p.unit),
-             small_unit(COVERAGE_FACTOR * p.u, p.unit)]
+            [
+                p.name,
+                meaning(p.name),
+                value_with_uncertainty(p.value, p.u, p.unit),
+                degrees,
+                small_unit(p.u, p.unit),
+                small_unit(COVERAGE_FACTOR * p.u, p.unit),
+            ]
         )
     return Table(
-        title=title, meaning=words, columns=["parameter", "what it is", "value", "in degrees", "u", "U (k = 2)"],
-        rows=rows, numeric=(2, 3, 4, 5), folded=len(rows) > 2 * MANY_PARAMETERS,
+        title=title,
+        meaning=words,
+        columns=["parameter", "what it is", "value", "in degrees", "u", "U (k = 2)"],
+        rows=rows,
+        numeric=(2, 3, 4, 5),
+        folded=len(rows) > 2 * MANY_PARAMETERS,
     )
 
 

@@ -13,8 +13,10 @@ def provenance_section(provenance: Provenance | None) -> Section:
         return Section(title="Provenance", blocks=[Words(paragraphs=[f"Provenance: {NOT_GIVEN}."])])
     seed = "none" if provenance.seed is None else str(provenance.seed)
     facts = [
-        ["tomopose", provenance.version], ["time (UTC)", provenance.time_utc or NOT_GIVEN],
-        ["platform", provenance.platform or NOT_GIVEN], ["seed", seed],
+        ["tomopose", provenance.version],
+        ["time (UTC)", provenance.time_utc or NOT_GIVEN],
+        ["platform", provenance.platform or NOT_GIVEN],
+        ["seed", seed],
         *[[name, version] for name, version in provenance.dependencies.items()],
         *[[f"argument {name}", cell(value)] for name, value in provenance.arguments.items()],
     ]
@@ -22,7 +24,9 @@ def provenance_section(provenance: Provenance | None) -> Section:
     if provenance.inputs:
         blocks.append(
             Table(
-                title="Inputs", meaning="SHA-256 of each file that was read.", columns=["file", "SHA-256"],
+                title="Inputs",
+                meaning="SHA-256 of each file that was read.",
+                columns=["file", "SHA-256"],
                 rows=[[name, digest] for name, digest in provenance.inputs.items()],
                 folded=len(provenance.inputs) > 12,
             )

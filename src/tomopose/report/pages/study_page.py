@@ -54,15 +54,17 @@ def study_report(
     groups = list(dict.fromkeys(str(r["group"]) for r in rows))
     tables: list[Block] = [_table(group, [r for r in rows if r["group"] == group]) for group in groups]
     statements = Table(
-        title="What it shows", meaning="Each statement is tested with the numbers of this run.",
+        title="What it shows",
+        meaning="Each statement is tested with the numbers of this run.",
         columns=["statement", "found", "holds"],
         rows=[[c["statement"], c["found"], "yes" if c["holds"] else "NO"] for c in checks],
     )
     sections = [
         Section(title="Statements", lead=question, blocks=[statements]),
         Section(title="Figures", blocks=list(figures)),
-        Section(title="Printed and ours", lead="u is the standard uncertainty that was stated with a number.",
-                blocks=tables),
+        Section(
+            title="Printed and ours", lead="u is the standard uncertainty that was stated with a number.", blocks=tables
+        ),
         Section(title="What differs, and why", blocks=[Words(items=list(notes))]),
         provenance_section(provenance),
     ]
@@ -85,11 +87,17 @@ def study_report(
 
 def _table(group: str, rows: Sequence[Mapping[str, Any]]) -> Table:
     return Table(
-        title=group, meaning="", columns=COLUMNS, numeric=(2, 3, 4),
+        title=group,
+        meaning="",
+        columns=COLUMNS,
+        numeric=(2, 3, 4),
         rows=[
             [
-                r["quantity"], r["unit"], with_uncertainty(r["printed"], None),
-                with_uncertainty(r["paper_method"], r["u_paper_method"]), with_uncertainty(r["best"], r["u"]),
+                r["quantity"],
+                r["unit"],
+                with_uncertainty(r["printed"], None),
+                with_uncertainty(r["paper_method"], r["u_paper_method"]),
+                with_uncertainty(r["best"], r["u"]),
                 "; ".join(t for t in (r["source"], r["note"]) if t),
             ]
             for r in rows
@@ -137,8 +145,13 @@ def _decorate(ax: Any, plan: Mapping[str, Any]) -> None:
     for place in plan.get("images", ()):
         png = base64.b64decode(str(place["source"]).split(",", 1)[1])
         left, top = place["x"], place["y"]
-        ax.imshow(image.imread(io.BytesIO(png), format="png"), aspect="auto", zorder=0, interpolation="antialiased",
-                  extent=(left, left + place["sizex"], top - place["sizey"], top))
+        ax.imshow(
+            image.imread(io.BytesIO(png), format="png"),
+            aspect="auto",
+            zorder=0,
+            interpolation="antialiased",
+            extent=(left, left + place["sizex"], top - place["sizey"], top),
+        )
     for words in plan.get("annotations", ()):
         text = str(words["text"]).replace("<br>", "\n")
         ax.text(words["x"], words["y"], text, ha="center", va="bottom", fontsize=10)
@@ -163,19 +176,31 @@ def _draw(ax: Any, trace: Mapping[str, Any], k: int, n: int) -> None:
         lines = "lines" in trace.get("mode", "lines")
         points = [trace["x"], trace["y"], *([trace["z"]] if kind == "scatter3d" else [])]
         ax.plot(
-            *points, linestyle={"dash": "--", "dot": ":"}.get(line.get("dash", ""), "-") if lines else "none",
-            color=(line if lines else marker).get("color"), linewidth=min(line.get("width", 1.5), 2.0),
-            marker="o" if "markers" in trace.get("mode", "") else "", markersize=0.6 * marker.get("size", 6), **shown,
+            *points,
+            linestyle={"dash": "--", "dot": ":"}.get(line.get("dash", ""), "-") if lines else "none",
+            color=(line if lines else marker).get("color"),
+            linewidth=min(line.get("width", 1.5), 2.0),
+            marker="o" if "markers" in trace.get("mode", "") else "",
+            markersize=0.6 * marker.get("size", 6),
+            **shown,
         )
     elif kind == "bar":
         x = range(len(trace["x"]))
-        ax.bar([i + (k - (n - 1) / 2) * 0.8 / n for i in x], trace["y"], width=0.8 / n, color=marker.get("color"),
-               **shown)
+        ax.bar(
+            [i + (k - (n - 1) / 2) * 0.8 / n for i in x], trace["y"], width=0.8 / n, color=marker.get("color"), **shown
+        )
         ax.set_xticks(list(x), [str(t) for t in trace["x"]], rotation=20, ha="right")
     elif kind == "heatmap":
         values = np.array([[np.nan if v is None else v for v in line] for line in trace["z"]], dtype=np.float64)
-        picture = ax.pcolormesh(trace["x"], trace["y"], values, vmin=trace.get("zmin"), vmax=trace.get("zmax"),
-                                shading="nearest", cmap=_colours(trace.get("colorscale")))
+        picture = ax.pcolormesh(
+            trace["x"],
+            trace["y"],
+            values,
+            vmin=trace.get("zmin"),
+            vmax=trace.get("zmax"),
+            shading="nearest",
+            cmap=_colours(trace.get("colorscale")),
+        )
         if trace.get("showscale", True):
             ax.figure.colorbar(picture, ax=ax, label=_text(trace.get("colorbar", {}).get("title")))
     else:

@@ -101,9 +101,7 @@ def wide_blur(image: Array, sigma: float) -> Array:
 def with_scatter(T: Array, scatter: Scatter) -> Array:
     """Primary plus scattered radiation."""
     if scatter.amount > 0:
-        return _spread(
-            T, scatter.sigma, potential=True, own=1.0, share=scatter.amount, constant=scatter.constant
-        )
+        return _spread(T, scatter.sigma, potential=True, own=1.0, share=scatter.amount, constant=scatter.constant)
     return T + scatter.constant if scatter.constant > 0 else T
 
 

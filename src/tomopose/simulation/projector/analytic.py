@@ -66,9 +66,7 @@ def _crossing(c: Any, work: Any, u_0: float, v_0: float, u_1: float, v_1: float,
 
 
 @njit(cache=True, nogil=True)
-def _split_cell(
-    c: Any, work: Any, left: float, low: float, h: float, along_u: bool, marks: Any, M: Any
-) -> None:
+def _split_cell(c: Any, work: Any, left: float, low: float, h: float, along_u: bool, marks: Any, M: Any) -> None:
     """Gather in M the moments of a cell that a steep edge crosses.
 
     x runs across the edge (along u or v), y along it; marks: signatures of the corners, m_xy.  The cell is cut at the

@@ -62,9 +62,7 @@ def _transmission(c: Any, work: Any, Q: Any, L: Any, u: float, v: float) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _corners(
-    c: Any, depth: int, P: Any, u_0: float, v_0: float, j_0: int, j_1: int, Q: Any, I: Any, seen: Any
-) -> bool:
+def _corners(c: Any, depth: int, P: Any, u_0: float, v_0: float, j_0: int, j_1: int, Q: Any, I: Any, seen: Any) -> bool:
     """Transmission and signature of the samples in rows j_0 to j_1; False where a list of crossings overflowed."""
     work, L = work_space(c, depth), np.empty(Q.shape[2])
     fill(P, j_0, j_1, Q, seen)

@@ -19,6 +19,7 @@ BLOCK = 4
 EVEN = 5e-4
 """Largest third difference of transmission over coarse corners that counts as smooth."""
 
+
 def kernel_scene(compiled: Compiled | None, beam: Beam, view: View, T_FW: dict[Frame, RigidTransform]) -> Any:
     """What the kernels take of a scene's solids (or of none), its beam and its view; boxes of shadows come last."""
     parts: tuple[Any, ...]

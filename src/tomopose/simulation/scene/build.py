@@ -153,9 +153,7 @@ def _detector(part: S.DetectorPart, b: int) -> Detector:
     changed = {
         "blur_sigma": part.blur_sigma_px / b,
         "mtf": None if part.mtf is None else MTF(frequency=frequency, value=part.mtf.value),
-        "scatter": Scatter(
-            constant=part.scatter.constant, amount=part.scatter.amount, sigma=part.scatter.sigma_px / b
-        ),
+        "scatter": Scatter(constant=part.scatter.constant, amount=part.scatter.amount, sigma=part.scatter.sigma_px / b),
         "glare": Glare(share=part.glare.share, sigma=part.glare.sigma_px / b),
     }
     return Detector(**{**values, **changed, "binning": b})

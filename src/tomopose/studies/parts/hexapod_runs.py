@@ -25,15 +25,17 @@ class SolvedRun:
     floor: float
 
 
-def solve_run(
-    magnification: float, n: int, seed: int, number: int, steps: Steps, progress: Progress
-) -> SolvedRun:
+def solve_run(magnification: float, n: int, seed: int, number: int, steps: Steps, progress: Progress) -> SolvedRun:
     """Run `number` at that magnification, from radiographs to both calibrations."""
     run = ball_run(magnification, n, seed, number=number)
     measured = measure_run(run, steps, f"centres-M{magnification}-{n}-run{number}", progress)
     theirs, _ = solve_as_paper(run, measured)
     ours = calibrate(
-        run.scanner, run.poses, measured.best, manipulator=believed_hexapod(magnification), model="kinematic",
+        run.scanner,
+        run.poses,
+        measured.best,
+        manipulator=believed_hexapod(magnification),
+        model="kinematic",
         hypotheses=False,
     )
     floor = float(np.hypot(scatter_floor(run, magnification), exact_rms(run, measured.best)))

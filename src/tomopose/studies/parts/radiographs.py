@@ -79,8 +79,13 @@ def read_out_windows(run: BallRun) -> Iterator[tuple[tuple[int, int], SimulatedR
         if u < 0 or v < 0 or u + 2 * half_u >= scanner.n_u or v + 2 * half_v >= scanner.n_v:
             raise OutOfViewError(f"pose {run.poses.pose_id[k]}: the ball leaves the detector", indices=[k])
         window = simulate_ball_run(
-            scanner.cropped(u=u, v=v, n_u=2 * half_u + 1, n_v=2 * half_v + 1), T_HT=run.T_HT, t=run.t,
-            poses=run.poses.select([k]), T_MH=run.T_MH[[k]], ball_diameter=BALL_DIAMETER, snr=run.snr,
+            scanner.cropped(u=u, v=v, n_u=2 * half_u + 1, n_v=2 * half_v + 1),
+            T_HT=run.T_HT,
+            t=run.t,
+            poses=run.poses.select([k]),
+            T_MH=run.T_MH[[k]],
+            ball_diameter=BALL_DIAMETER,
+            snr=run.snr,
             seed=int(seeds[k]),
         )
         if beam is None:
@@ -98,10 +103,17 @@ def _measure_chunk(run: BallRun, progress: Progress) -> dict[str, Any]:
         by_ellipse.append(ellipse_method(image, run.scanner, origin=origin))
         progress(k + 1, len(run.poses))
     best = detect(
-        images, run.scanner, ball_diameter=BALL_DIAMETER, origin=np.array(origins), pose_id=run.poses.pose_id  # type: ignore[arg-type]
+        images,
+        run.scanner,
+        ball_diameter=BALL_DIAMETER,
+        origin=np.array(origins),
+        pose_id=run.poses.pose_id,  # type: ignore[arg-type]
     )
     return {
-        "by_ellipse": by_ellipse, "x_D": best.x_D, "covariance": best.covariance, "seen": best.seen,
+        "by_ellipse": by_ellipse,
+        "x_D": best.x_D,
+        "covariance": best.covariance,
+        "seen": best.seen,
         "status": best.status,
     }
 
@@ -119,8 +131,13 @@ def measure_run(run: BallRun, steps: Steps, name: str, progress: Progress) -> Me
             progress(before + done, n)
 
         parts.append(
-            steps.of(f"{name}-{c}", lambda part=part, count=count: _measure_chunk(part, count),  # type: ignore[misc]
-                     poses=part.x_D, seed=part.seed, snr=part.snr)
+            steps.of(
+                f"{name}-{c}",
+                lambda part=part, count=count: _measure_chunk(part, count),  # type: ignore[misc]
+                poses=part.x_D,
+                seed=part.seed,
+                snr=part.snr,
+            )
         )
         progress(int(rows[-1]) + 1, n)
 
@@ -130,8 +147,11 @@ def measure_run(run: BallRun, steps: Steps, name: str, progress: Progress) -> Me
     return Measured(
         by_ellipse=column("by_ellipse"),
         best=BallObservations(
-            x_D=column("x_D"), covariance=column("covariance"), pose_id=run.poses.pose_id,
-            seen=column("seen").astype(bool), status=tuple(s for p in parts for s in p["status"]),
+            x_D=column("x_D"),
+            covariance=column("covariance"),
+            pose_id=run.poses.pose_id,
+            seen=column("seen").astype(bool),
+            status=tuple(s for p in parts for s in p["status"]),
         ),
     )
 

@@ -90,22 +90,33 @@ class StudyResult:
     def to_json(self) -> dict[str, Any]:
         """The content of study.json."""
         return {
-            "name": self.name, "title": self.title, "paper": self.paper, "question": self.question,
-            "scale": self.scale, "seed": self.seed, "holds": self.holds,
+            "name": self.name,
+            "title": self.title,
+            "paper": self.paper,
+            "question": self.question,
+            "scale": self.scale,
+            "seed": self.seed,
+            "holds": self.holds,
             "rows": [asdict(r) for r in self.rows],
             "checks": [asdict(c) for c in self.checks],
             "figures": [f.title for f in self.figures],
-            "notes": list(self.notes), "seconds": self.seconds, "provenance": self.provenance.to_json(),
+            "notes": list(self.notes),
+            "seconds": self.seconds,
+            "provenance": self.provenance.to_json(),
         }
 
 
 def check_below(statement: str, value: float, limit: float, unit: str) -> StudyCheck:
     """Holds where value <= limit."""
-    return StudyCheck(statement=statement, found=f"{value:.3g} {unit} (limit {limit:.3g})".strip(),
-                      holds=bool(value <= limit))
+    return StudyCheck(
+        statement=statement, found=f"{value:.3g} {unit} (limit {limit:.3g})".strip(), holds=bool(value <= limit)
+    )
 
 
 def check_between(statement: str, value: float, low: float, high: float, unit: str) -> StudyCheck:
     """Holds where low <= value <= high."""
-    return StudyCheck(statement=statement, found=f"{value:.3g} {unit} (from {low:g} to {high:g})".strip(),
-                      holds=bool(low <= value <= high))
+    return StudyCheck(
+        statement=statement,
+        found=f"{value:.3g} {unit} (from {low:g} to {high:g})".strip(),
+        holds=bool(low <= value <= high),
+    )

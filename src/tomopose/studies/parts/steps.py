@@ -63,9 +63,18 @@ class Steps:
 
         The content is plain JSON, also where nothing is kept, so that a resumed run gives the same numbers.
         """
-        wanted = json.loads(json.dumps(plain({
-            "version": package_version(), "sources": sources(compute.__module__), **self.key, **key,
-        })))
+        wanted = json.loads(
+            json.dumps(
+                plain(
+                    {
+                        "version": package_version(),
+                        "sources": sources(compute.__module__),
+                        **self.key,
+                        **key,
+                    }
+                )
+            )
+        )
         path = None if self.folder is None else self.folder / f"{name}.json"
         if path is not None and path.exists():
             try:

@@ -69,7 +69,13 @@ def disc_profile(scan: PoseSequence, scale: Scale) -> dict[str, Any]:
     n, n_z = int(2 * (RADIUS + 3.0) / side), int(2 * half_height / side)
     grid = VoxelGrid(shape=(n_z, n, n), spacing=side)
     volume = reconstruct(
-        images, matrices, grid, images_are="line-integrals", engine="cpu", algorithm="fdk", consistency="off",
+        images,
+        matrices,
+        grid,
+        images_are="line-integrals",
+        engine="cpu",
+        algorithm="fdk",
+        consistency="off",
     )
     x = grid.origin[0] + side * np.arange(n)
     core = np.hypot(x[:, None], x[None, :]) < 4.0
@@ -99,39 +105,72 @@ def rows_and_checks(found: Mapping[str, Mapping[str, Any]]) -> tuple[list[StudyR
     }
     group = f"M {MAGNIFICATION}, stack of discs"
     rows = [
-        StudyRow(group=group, quantity=f"{name}: error around the {where}, rms", unit="1", best=value,
-                 note="1: the discs' value")
-        for where, values in part.items() for name, value in values.items()
+        StudyRow(
+            group=group,
+            quantity=f"{name}: error around the {where}, rms",
+            unit="1",
+            best=value,
+            note="1: the discs' value",
+        )
+        for where, values in part.items()
+        for name, value in values.items()
     ]
     outer, middle = part["outermost six discs"], part["middle three discs"]
     return rows, [
-        StudyCheck(statement="on the circular path flat faces are smeared with height",
-                   found=f"error {middle['circular scan']:.3g} in the middle, {outer['circular scan']:.3g} outside",
-                   holds=outer["circular scan"] > 3 * middle["circular scan"]),
-        check_below("the 3D scan leaves less than half of that error outside",
-                    outer["3D scan"] / outer["circular scan"], 0.5, ""),
+        StudyCheck(
+            statement="on the circular path flat faces are smeared with height",
+            found=f"error {middle['circular scan']:.3g} in the middle, {outer['circular scan']:.3g} outside",
+            holds=outer["circular scan"] > 3 * middle["circular scan"],
+        ),
+        check_below(
+            "the 3D scan leaves less than half of that error outside",
+            outer["3D scan"] / outer["circular scan"],
+            0.5,
+            "",
+        ),
     ]
 
 
 def figures(found: Mapping[str, Mapping[str, Any]]) -> list[Figure]:
     """Profiles along the axis, and a section through each volume."""
     lines = [
-        {"type": "scatter", "mode": "lines", "name": name, "x": p["z"], "y": p["axis"],
-         "line": {"color": COLOURS[name], "width": 1.6}}
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "name": name,
+            "x": p["z"],
+            "y": p["axis"],
+            "line": {"color": COLOURS[name], "width": 1.6},
+        }
         for name, p in found.items()
     ]
     profile = Figure(
-        title="A stack of discs along its axis", meaning="Value over that of the discs, mean of a core of 4 mm radius.",
-        look_for="Discs and gaps as flat outside as in the middle; on the circular path they are not.", data=lines,
+        title="A stack of discs along its axis",
+        meaning="Value over that of the discs, mean of a core of 4 mm radius.",
+        look_for="Discs and gaps as flat outside as in the middle; on the circular path they are not.",
+        data=lines,
         layout=layout(xaxis=axis("z / mm"), yaxis=axis("value")),
     )
     sections = [
         Figure(
-            title=f"Stack of discs, {name}", meaning="Section y = 0; 1 is the discs' attenuation.",
+            title=f"Stack of discs, {name}",
+            meaning="Section y = 0; 1 is the discs' attenuation.",
             look_for="Flat faces with sharp edges; smeared ones are cone-beam artefacts.",
-            data=[{"type": "heatmap", "x": p["x"], "y": p["z"], "z": p["section"], "zmin": 0.0, "zmax": 1.2,
-                   "colorscale": SEQUENTIAL, "colorbar": colour_bar("value")}],
-            layout=layout(xaxis=axis("x / mm"), yaxis=axis("z / mm")), wide=False, height=440,
+            data=[
+                {
+                    "type": "heatmap",
+                    "x": p["x"],
+                    "y": p["z"],
+                    "z": p["section"],
+                    "zmin": 0.0,
+                    "zmax": 1.2,
+                    "colorscale": SEQUENTIAL,
+                    "colorbar": colour_bar("value"),
+                }
+            ],
+            layout=layout(xaxis=axis("x / mm"), yaxis=axis("z / mm")),
+            wide=False,
+            height=440,
         )
         for name, p in found.items()
     ]

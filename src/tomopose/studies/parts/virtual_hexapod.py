@@ -68,8 +68,12 @@ def ball_run(magnification: float, n: int, seed: int, *, number: int) -> BallRun
     entropy = np.random.SeedSequence([seed, round(10 * magnification), n, number])
     motion, images = entropy.spawn(2)
     return BallRun(
-        scanner=paper_scanner(magnification), T_HT=setup.T_HT, t=setup.t, poses=poses,
-        T_MH=real_T_MH(poses, magnification, np.random.default_rng(motion)), seed=int(images.generate_state(1)[0]),
+        scanner=paper_scanner(magnification),
+        T_HT=setup.T_HT,
+        t=setup.t,
+        poses=poses,
+        T_MH=real_T_MH(poses, magnification, np.random.default_rng(motion)),
+        seed=int(images.generate_state(1)[0]),
     )
 
 
@@ -89,7 +93,9 @@ def scan_error_um(calibration: Calibration, run: BallRun, magnification: float) 
     rigid pose removed, the plate's scatter left out."""
     scan = scan_of(magnification)
     P_true = eq5_matrices(
-        run.scanner, T_HT=run.T_HT, T_MH=real_T_MH(scan, magnification),
+        run.scanner,
+        T_HT=run.T_HT,
+        T_MH=real_T_MH(scan, magnification),
         alpha=np.zeros(len(scan)) if scan.alpha is None else scan.alpha,
     )
     d = without_object_pose(projection_matrices(calibration, scan).P, P_true, object_points())

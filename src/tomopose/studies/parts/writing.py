@@ -32,9 +32,16 @@ def write_study(folder: str | Path, result: StudyResult, *, force: bool = False)
     write_report(
         paths[1],
         study_report(
-            title=result.title, paper=result.paper, question=result.question, rows=content["rows"],
-            checks=content["checks"], figures=result.figures, notes=result.notes, scale=result.scale,
-            seconds=result.seconds, provenance=result.provenance,
+            title=result.title,
+            paper=result.paper,
+            question=result.question,
+            rows=content["rows"],
+            checks=content["checks"],
+            figures=result.figures,
+            notes=result.notes,
+            scale=result.scale,
+            seconds=result.seconds,
+            provenance=result.provenance,
         ),
     )
     for path, figure in zip(pictures, result.figures, strict=True):

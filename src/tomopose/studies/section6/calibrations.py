@@ -31,21 +31,30 @@ def planned_run(magnification: float, seed: int, number: int) -> BallRun:
     poses = mixed_poses(np.random.default_rng(np.random.SeedSequence([seed, 62])), n=len(base.poses))
     motion, images = np.random.SeedSequence([seed, 63, round(10 * magnification), number]).spawn(2)
     return replace(
-        base, poses=poses, T_MH=real_T_MH(poses, magnification, np.random.default_rng(motion)),
+        base,
+        poses=poses,
+        T_MH=real_T_MH(poses, magnification, np.random.default_rng(motion)),
         seed=int(images.generate_state(1)[0]),
     )
 
 
 def rigid(run: BallRun, observations: BallObservations) -> Calibration:
     """Eq. (7) with all centres and equal weights, as the paper."""
-    return calibrate(run.scanner, run.poses, observations, model="rigid", robust=False, hypotheses=False,
-                     pose_noise=None)
+    return calibrate(
+        run.scanner, run.poses, observations, model="rigid", robust=False, hypotheses=False, pose_noise=None
+    )
 
 
 def kinematic(run: BallRun, observations: BallObservations, magnification: float) -> Calibration:
     """With the manipulator's errors identified; it is not told their form."""
-    return calibrate(run.scanner, run.poses, observations, manipulator=believed_hexapod(magnification),
-                     model="kinematic", hypotheses=False)
+    return calibrate(
+        run.scanner,
+        run.poses,
+        observations,
+        manipulator=believed_hexapod(magnification),
+        model="kinematic",
+        hypotheses=False,
+    )
 
 
 def projected(run: BallRun, rng: np.random.Generator) -> BallObservations:
@@ -62,8 +71,10 @@ def calibrations(
     theirs, ours = ball_run(magnification, GRID, seed, number=number), planned_run(magnification, seed, number)
     if not radiographs:
         rng = np.random.default_rng(np.random.SeedSequence([seed, 61, round(10 * magnification), number]))
-        return {"paper": rigid(theirs, projected(theirs, rng)),
-                "best": kinematic(ours, projected(ours, rng), magnification)}
+        return {
+            "paper": rigid(theirs, projected(theirs, rng)),
+            "best": kinematic(ours, projected(ours, rng), magnification),
+        }
     n = len(theirs.poses)
     name = f"centres-M{magnification}-{GRID}-run{number}"
     by_ellipse = measure_run(theirs, steps, name, lambda done, _: progress(done, 2 * n))

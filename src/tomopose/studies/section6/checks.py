@@ -38,33 +38,77 @@ def checks_of(rows: list[StudyRow], found: Found, mesh: Mesh, *, strict: bool) -
         return check_below(f"by our best {statement}", ours / least, factor, "x the better circular volume's")
 
     checks = [
-        check_between("fig. 12: by the paper's method the cylinder areas' largest deviation is of the printed order",
-                      of(f"Fig. 12, {tilted}", "cylinder areas, largest deviation", "paper_method"),
-                      PRINTED_CYLINDER_UM / 2, 2 * PRINTED_CYLINDER_UM, "um"),
-        StudyCheck(statement="fig. 12: by the paper's method the deviations repeat with the tilt's seven periods",
-                   found=f"the strongest part has {loudest} periods", holds=loudest == PERIODS),
-        check_below("fig. 12: by our best the part with seven periods is five times smaller or better",
-                    of(f"Fig. 12, {tilted}", part, "best") / of(f"Fig. 12, {tilted}", part, "paper_method"), 0.2, ""),
-        against_circle("the 3D scan's cylinder areas are within 1.2 x of the circular scan's (fig. 12, rms)", "Fig. 12",
-                       "cylinder areas, rms", CIRCLE_FACTOR),
-        check_below("fig. 13: by our best the 3D scan's lengths lie within the MPE",
-                    of(f"Fig. 13, {tilted}", "errors of L1 to L7, largest", "best"), float(limit(0.0)[0]), "um"),
-        against_circle("the 3D scan's lengths are not worse than the circular scan's (fig. 13, rms)", "Fig. 13",
-                       "errors of L1 to L7, rms", 1.0),
-        against_circle("the 3D scan's sphericities are not worse than the circular scan's (fig. 16)", "Fig. 16",
-                       "sphericity, mean of 27", 1.0),
-        against_circle("the 3D scan's distances are not worse than the circular scan's (fig. 14, rms)", "Fig. 14",
-                       "errors of 351 distances, rms", 1.0),
-        against_circle("the 3D scan's diameters scatter no more than the circular scan's, but for chance (fig. 15)",
-                       "Fig. 15", "scatter of 27 diameters", CHANCE),
+        check_between(
+            "fig. 12: by the paper's method the cylinder areas' largest deviation is of the printed order",
+            of(f"Fig. 12, {tilted}", "cylinder areas, largest deviation", "paper_method"),
+            PRINTED_CYLINDER_UM / 2,
+            2 * PRINTED_CYLINDER_UM,
+            "um",
+        ),
+        StudyCheck(
+            statement="fig. 12: by the paper's method the deviations repeat with the tilt's seven periods",
+            found=f"the strongest part has {loudest} periods",
+            holds=loudest == PERIODS,
+        ),
+        check_below(
+            "fig. 12: by our best the part with seven periods is five times smaller or better",
+            of(f"Fig. 12, {tilted}", part, "best") / of(f"Fig. 12, {tilted}", part, "paper_method"),
+            0.2,
+            "",
+        ),
+        against_circle(
+            "the 3D scan's cylinder areas are within 1.2 x of the circular scan's (fig. 12, rms)",
+            "Fig. 12",
+            "cylinder areas, rms",
+            CIRCLE_FACTOR,
+        ),
+        check_below(
+            "fig. 13: by our best the 3D scan's lengths lie within the MPE",
+            of(f"Fig. 13, {tilted}", "errors of L1 to L7, largest", "best"),
+            float(limit(0.0)[0]),
+            "um",
+        ),
+        against_circle(
+            "the 3D scan's lengths are not worse than the circular scan's (fig. 13, rms)",
+            "Fig. 13",
+            "errors of L1 to L7, rms",
+            1.0,
+        ),
+        against_circle(
+            "the 3D scan's sphericities are not worse than the circular scan's (fig. 16)",
+            "Fig. 16",
+            "sphericity, mean of 27",
+            1.0,
+        ),
+        against_circle(
+            "the 3D scan's distances are not worse than the circular scan's (fig. 14, rms)",
+            "Fig. 14",
+            "errors of 351 distances, rms",
+            1.0,
+        ),
+        against_circle(
+            "the 3D scan's diameters scatter no more than the circular scan's, but for chance (fig. 15)",
+            "Fig. 15",
+            "scatter of 27 diameters",
+            CHANCE,
+        ),
     ]
     if all(f"standard-3D-best-run1-{order}" in found for order in ORDERS):
         in_turn, golden = (rms(found[f"standard-3D-best-run1-{order}"]["distance_um"]) for order in ORDERS)
-        checks.append(StudyCheck(
-            statement="in one iteration of SART views in sequence are worse than in golden order (figs. 14, 16)",
-            found=f"{in_turn:.3g} um against {golden:.3g} um", holds=in_turn > golden,
-        ))
+        checks.append(
+            StudyCheck(
+                statement="in one iteration of SART views in sequence are worse than in golden order (figs. 14, 16)",
+                found=f"{in_turn:.3g} um against {golden:.3g} um",
+                holds=in_turn > golden,
+            )
+        )
     if strict:
-        checks.append(check_below("fig. 14: by our best the 3D scan's 351 distances lie within the MPE",
-                                  of(f"Fig. 14, {tilted}", "largest share of the MPE", "best"), 1.0, "of it"))
+        checks.append(
+            check_below(
+                "fig. 14: by our best the 3D scan's 351 distances lie within the MPE",
+                of(f"Fig. 14, {tilted}", "largest share of the MPE", "best"),
+                1.0,
+                "of it",
+            )
+        )
     return checks

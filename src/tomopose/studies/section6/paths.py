@@ -28,9 +28,7 @@ def mesh_paths(P: Array, solid: MeshSolid, n_u: int, n_v: int) -> Array:
     return mesh_path_image((solid,), View.of_matrix(P), {solid.frame: RigidTransform.identity(Frame.W)}, window)
 
 
-def ball_paths(
-    P: Array, centres: Array, radii: Array, shaft_radius: float, bottom: Array, n_u: int, n_v: int
-) -> Array:
+def ball_paths(P: Array, centres: Array, radii: Array, shaft_radius: float, bottom: Array, n_u: int, n_v: int) -> Array:
     """Path lengths (n_v, n_u), mm, through balls, centres (m, 3), mm in W, and radii (m,), each on an upright shaft
     from the height `bottom` (m,); what a ball and its own shaft share counts once."""
     out = np.zeros((n_v, n_u))

@@ -93,12 +93,24 @@ def scan_with(thing: Object, path: Path, numbers: Numbers, seed: int) -> Scan:
     motion, noise = np.random.SeedSequence([seed, 6, round(10 * m), path == "3D"]).spawn(2)
     T_MH = real_T_MH(poses, m, np.random.default_rng(motion)) if path == "3D" else poses.T_MH
     truth = ProjectionMatrices(
-        P=eq5_matrices(full, T_HT=setup.T_HT, T_MH=T_MH, alpha=alpha_of(poses)), n_u=full.n_u, n_v=full.n_v,
-        p_u=full.p_u, p_v=full.p_v, pose_id=poses.pose_id, scanner=full,
+        P=eq5_matrices(full, T_HT=setup.T_HT, T_MH=T_MH, alpha=alpha_of(poses)),
+        n_u=full.n_u,
+        n_v=full.n_v,
+        p_u=full.p_u,
+        p_v=full.p_v,
+        pose_id=poses.pose_id,
+        scanner=full,
     ).binned(binning)
     return Scan(
-        thing=thing, path=path, poses=poses, truth=truth, scanner=full.binned(binning), binning=binning,
-        samples=numbers.samples, edge=numbers.edge, seed=int(noise.generate_state(1)[0]),
+        thing=thing,
+        path=path,
+        poses=poses,
+        truth=truth,
+        scanner=full.binned(binning),
+        binning=binning,
+        samples=numbers.samples,
+        edge=numbers.edge,
+        seed=int(noise.generate_state(1)[0]),
     )
 
 

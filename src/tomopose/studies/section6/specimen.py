@@ -80,9 +80,7 @@ def azimuth(mesh: Mesh) -> Array:
     return np.asarray(np.arctan2(n[:, 1], n[:, 0]))
 
 
-def plan_for(
-    alignment: Alignment, search_mm: float | None = None, sigma_mm: float | None = None
-) -> MeasurementPlan:
+def plan_for(alignment: Alignment, search_mm: float | None = None, sigma_mm: float | None = None) -> MeasurementPlan:
     """L1 to L6 between a cuboid's outer plane and its flat, L7 between the calottes' centres."""
     features: dict[str, Any] = {}
     measurands: list[dict[str, Any]] = []
@@ -92,26 +90,42 @@ def plan_for(
         z = np.array([0.0, 0.0, 1.0])
         plane = {"kind": "plane", "direction": e.tolist(), "n_points": 400}
         features[f"flat {k + 1}"] = {
-            **plane, "point": (FLAT * e - 6.0 * side * z).tolist(), "u": (3.0 * across).tolist(),
+            **plane,
+            "point": (FLAT * e - 6.0 * side * z).tolist(),
+            "u": (3.0 * across).tolist(),
             "v": (8.0 * z).tolist(),
         }
         features[f"cuboid {k + 1}"] = {
-            **plane, "point": ((FLAT + height) * e + 9.0 * side * z).tolist(),
-            "u": (0.3 * CUBOID_SIDE * across).tolist(), "v": (0.5 * CUBOID_SIDE * z).tolist(), "safety_mm": 0.8,
+            **plane,
+            "point": ((FLAT + height) * e + 9.0 * side * z).tolist(),
+            "u": (0.3 * CUBOID_SIDE * across).tolist(),
+            "v": (0.5 * CUBOID_SIDE * z).tolist(),
+            "safety_mm": 0.8,
         }
         measurands.append({"name": f"L{k + 1}", "kind": "distance", "of": [f"flat {k + 1}", f"cuboid {k + 1}"]})
     for k, x in enumerate((-CALOTTE_DISTANCE / 2, CALOTTE_DISTANCE / 2)):
         features[f"calotte {k + 1}"] = {
-            "kind": "calotte", "point": [x, 0.0, -LENGTH / 2], "radius_mm": CALOTTE_RADIUS, "direction": [0, 0, 1],
-            "cap_deg": 80.0, "inward": True, "n_points": 400,
+            "kind": "calotte",
+            "point": [x, 0.0, -LENGTH / 2],
+            "radius_mm": CALOTTE_RADIUS,
+            "direction": [0, 0, 1],
+            "cap_deg": 80.0,
+            "inward": True,
+            "n_points": 400,
         }
     measurands.append({"name": "L7", "kind": "distance", "of": ["calotte 1", "calotte 2"]})
     start = np.column_stack([alignment.R, alignment.t]).tolist()
-    return plan_from({
-        "schema": "tomopose/measurement-plan/1", "unit": "mm", "name": "multi-feature specimen", "features": features,
-        "measurands": measurands, "alignment": {"start": start},
-        "surface": {"method": "esf", "search_distance_mm": search_mm, "sigma_mm": sigma_mm},
-    })
+    return plan_from(
+        {
+            "schema": "tomopose/measurement-plan/1",
+            "unit": "mm",
+            "name": "multi-feature specimen",
+            "features": features,
+            "measurands": measurands,
+            "alignment": {"start": start},
+            "surface": {"method": "esf", "search_distance_mm": search_mm, "sigma_mm": sigma_mm},
+        }
+    )
 
 
 @functools.lru_cache(maxsize=2)
@@ -134,9 +148,7 @@ def measure_specimen(volume: Volume, edge: float) -> dict[str, Any]:
     search = max(SEARCH_MM, SEARCH_VOXELS * float(volume.grid.spacing[0]))
     smooth = ~mesh.on_edge
     sigma = blur_of(volume, start.points(mesh.points[smooth]), start.directions(mesh.normals[smooth]), search)
-    found = compare(
-        volume, mesh, alignment=start, fit="best-fit", search_mm=search, settings=EdgeSettings(sigma=sigma)
-    )
+    found = compare(volume, mesh, alignment=start, fit="best-fit", search_mm=search, settings=EdgeSettings(sigma=sigma))
     lengths = measure(volume, plan_for(found.alignment, search, sigma))
     true = true_lengths(edge)
     deviation = np.round(MICROMETRES_PER_MM * found.deviation, 2)
@@ -148,6 +160,7 @@ def measure_specimen(volume: Volume, edge: float) -> dict[str, Any]:
         "length_um": {r.name: MICROMETRES_PER_MM * (r.value - true[r.name]) for r in lengths.results},
         "slice": np.round(np.asarray(values[::step, ::step], dtype=np.float64), 5).tolist(),
         "slice_side_mm": step * float(volume.grid.spacing[0]),
-        "blur_mm": sigma, "moved_um": MICROMETRES_PER_MM * found.moved_mm,
+        "blur_mm": sigma,
+        "moved_um": MICROMETRES_PER_MM * found.moved_mm,
         "turned_urad": 1e6 * found.turned_rad,
     }

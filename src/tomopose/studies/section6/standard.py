@@ -27,30 +27,51 @@ def plan_for(search_mm: float, sigma_mm: float) -> MeasurementPlan:
     centres, diameters = sphere_centres(), sphere_diameters()
     features = {
         f"sphere {k + 1:02d}": {
-            "kind": "calotte", "point": c.tolist(), "radius_mm": float(d) / 2, "direction": [0, 0, 1],
-            "cap_deg": CAP_DEG, "safety_mm": 0.5, "n_points": POINTS,
+            "kind": "calotte",
+            "point": c.tolist(),
+            "radius_mm": float(d) / 2,
+            "direction": [0, 0, 1],
+            "cap_deg": CAP_DEG,
+            "safety_mm": 0.5,
+            "n_points": POINTS,
         }
         for k, (c, d) in enumerate(zip(centres, diameters, strict=True))
     }
     names = list(features)
     measurands: list[dict[str, Any]] = [
-        {"name": f"SD {i + 1:02d}-{j + 1:02d}", "kind": "distance", "of": [names[i], names[j]],
-         "calibrated_mm": float(np.linalg.norm(centres[i] - centres[j]))}
+        {
+            "name": f"SD {i + 1:02d}-{j + 1:02d}",
+            "kind": "distance",
+            "of": [names[i], names[j]],
+            "calibrated_mm": float(np.linalg.norm(centres[i] - centres[j])),
+        }
         for i, j in combinations(range(len(names)), 2)
     ]
     for kind in ("diameter", *FORMS):
         measurands += [
-            {"name": f"{kind} {k + 1:02d}", "kind": kind, "of": [name],
-             **({"calibrated_mm": float(diameters[k])} if kind == "diameter" else {})}
+            {
+                "name": f"{kind} {k + 1:02d}",
+                "kind": kind,
+                "of": [name],
+                **({"calibrated_mm": float(diameters[k])} if kind == "diameter" else {}),
+            }
             for k, name in enumerate(names)
         ]
-    return plan_from({
-        "schema": "tomopose/measurement-plan/1", "unit": "mm", "name": "multi-sphere standard", "features": features,
-        "measurands": measurands,
-        "surface": {
-            "method": "esf", "search_distance_mm": search_mm, "sigma_mm": sigma_mm, "curvature_correction": True,
-        },
-    })
+    return plan_from(
+        {
+            "schema": "tomopose/measurement-plan/1",
+            "unit": "mm",
+            "name": "multi-sphere standard",
+            "features": features,
+            "measurands": measurands,
+            "surface": {
+                "method": "esf",
+                "search_distance_mm": search_mm,
+                "sigma_mm": sigma_mm,
+                "curvature_correction": True,
+            },
+        }
+    )
 
 
 def true_distances() -> list[float]:

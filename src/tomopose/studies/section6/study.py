@@ -26,12 +26,20 @@ from tomopose.trajectory.completeness import source_path
 
 PLAN: Mapping[Scale, Numbers] = {
     "small": Numbers(
-        binning={"specimen": 10, "standard": 8}, views={"specimen": 210, "standard": 252},
-        runs={"specimen": (1,), "standard": (1, 2)}, edge=1.0, samples=2, radiographs=False,
+        binning={"specimen": 10, "standard": 8},
+        views={"specimen": 210, "standard": 252},
+        runs={"specimen": (1,), "standard": (1, 2)},
+        edge=1.0,
+        samples=2,
+        radiographs=False,
     ),
     "paper": Numbers(
-        binning={"specimen": 2, "standard": 2}, views={"specimen": 900, "standard": 1000},
-        runs={"specimen": (1,), "standard": (1,)}, edge=0.25, samples=2, radiographs=True,
+        binning={"specimen": 2, "standard": 2},
+        views={"specimen": 900, "standard": 1000},
+        runs={"specimen": (1,), "standard": (1,)},
+        edge=0.25,
+        samples=2,
+        radiographs=True,
     ),
 }
 """Binning, views and calibration of table 3 at scale "paper"."""
@@ -133,8 +141,14 @@ def run_with(
         for case in cases[thing]:
             scan = scans[case.path]
             found[case.name] = measured(
-                case, scan, images[case.path], lambda c=case, s=scan, d=solved: matrices_for(c, s, d),  # type: ignore[misc]
-                numbers, options_of(case), steps, part,
+                case,
+                scan,
+                images[case.path],
+                lambda c=case, s=scan, d=solved: matrices_for(c, s, d),  # type: ignore[misc]
+                numbers,
+                options_of(case),
+                steps,
+                part,
             )
             done += 1
             part(0, 1)

@@ -102,22 +102,41 @@ def specimen_rows(found: Found, mesh: Mesh, source: Array, runs: tuple[int, ...]
         first = (path, run) == ("3D", 1)
         group = f"Fig. 12, {path} scan" + (f", calibration run {run}" if run else "")
         rows += [
-            row(group, "cylinder areas, largest deviation", *both.of(lambda c: largest(deviations_of(c)[cylinder])),
-                source="sec. 6.3" if first else "", printed=PRINTED_CYLINDER_UM if first else None,
-                note="printed: around" if first else ""),
+            row(
+                group,
+                "cylinder areas, largest deviation",
+                *both.of(lambda c: largest(deviations_of(c)[cylinder])),
+                source="sec. 6.3" if first else "",
+                printed=PRINTED_CYLINDER_UM if first else None,
+                note="printed: around" if first else "",
+            ),
             row(group, "cylinder areas, rms", *both.of(lambda c: rms(deviations_of(c)[cylinder]))),
-            row(group, "cylinder areas, part with seven periods",
+            row(
+                group,
+                "cylinder areas, part with seven periods",
                 *both.of(lambda c: float(waves(deviations_of(c)[cylinder], phi[cylinder])[PERIODS])),
-                source="sec. 6.3" if first else "", note="printed: periodic, no figure" if first else ""),
-            row(group, "six cuboids, largest deviation", *both.of(lambda c: largest(deviations_of(c)[cuboid])),
-                source="sec. 6.3" if first else "", printed=PRINTED_CUBOID_UM if first else None,
-                note="printed: roughly" if first else ""),
+                source="sec. 6.3" if first else "",
+                note="printed: periodic, no figure" if first else "",
+            ),
+            row(
+                group,
+                "six cuboids, largest deviation",
+                *both.of(lambda c: largest(deviations_of(c)[cuboid])),
+                source="sec. 6.3" if first else "",
+                printed=PRINTED_CUBOID_UM if first else None,
+                note="printed: roughly" if first else "",
+            ),
             row(group, "whole surface, rms", *both.of(lambda c: rms(deviations_of(c)[~unseen]))),
         ]
         known = [np.isfinite(deviations_of(c)[unseen]).sum() for c in (both.theirs, both.ours) if c is not None]
         if min(known) >= LEAST_UNSEEN:
-            rows.append(row(group, "where a circle does not see the surface, rms",
-                            *both.of(lambda c: rms(deviations_of(c)[unseen]))))
+            rows.append(
+                row(
+                    group,
+                    "where a circle does not see the surface, rms",
+                    *both.of(lambda c: rms(deviations_of(c)[unseen])),
+                )
+            )
         group = group.replace("Fig. 12", "Fig. 13")
         rows += [
             row(group, f"errors of L1 to L7, {name}", *both.of(lambda c, f=f: f(list(c["length_um"].values()))))  # type: ignore[misc]
@@ -136,41 +155,73 @@ def standard_rows(found: Found, runs: tuple[int, ...]) -> list[StudyRow]:
         rows += [
             row(f"Fig. 14, {scan}", "errors of 351 distances, rms", *both.of(lambda c: rms(c["distance_um"]))),
             row(f"Fig. 14, {scan}", "errors of 351 distances, largest", *both.of(lambda c: largest(c["distance_um"]))),
-            row(f"Fig. 14, {scan}", "largest share of the MPE",
-                *both.of(lambda c: float(np.max(np.abs(c["distance_um"]) / mpe))), unit="1", source="sec. 6.3",
-                note="printed: below the MPE"),
+            row(
+                f"Fig. 14, {scan}",
+                "largest share of the MPE",
+                *both.of(lambda c: float(np.max(np.abs(c["distance_um"]) / mpe))),
+                unit="1",
+                source="sec. 6.3",
+                note="printed: below the MPE",
+            ),
             row(f"Fig. 15, {scan}", "errors of 27 diameters, rms", *both.of(lambda c: rms(c["diameter_um"]))),
             row(f"Fig. 15, {scan}", "scatter of 27 diameters", *both.of(lambda c: float(np.std(c["diameter_um"])))),
-            row(f"Fig. 16, {scan}", "sphericity, mean of 27", *both.of(lambda c: float(np.mean(c["form_um"]))),
-                note="all points of a ball"),
-            row(f"Fig. 16, {scan}", "sphericity of 95 %, mean of 27",
-                *both.of(lambda c: float(np.mean(c["form_95_um"])))),
+            row(
+                f"Fig. 16, {scan}",
+                "sphericity, mean of 27",
+                *both.of(lambda c: float(np.mean(c["form_um"]))),
+                note="all points of a ball",
+            ),
+            row(
+                f"Fig. 16, {scan}",
+                "sphericity of 95 %, mean of 27",
+                *both.of(lambda c: float(np.mean(c["form_95_um"]))),
+            ),
         ]
     if true := found.get("standard-3D-best-run0"):
         rows += [
-            StudyRow(group="3D scan of the standard with the true matrices", quantity=name, unit="um", best=value,
-                     note="what path, views and voxels leave")
-            for name, value in (("errors of 351 distances, rms", rms(true["distance_um"])),
-                                ("scatter of 27 diameters", float(np.std(true["diameter_um"]))),
-                                ("sphericity, mean of 27", float(np.mean(true["form_um"]))))
+            StudyRow(
+                group="3D scan of the standard with the true matrices",
+                quantity=name,
+                unit="um",
+                best=value,
+                note="what path, views and voxels leave",
+            )
+            for name, value in (
+                ("errors of 351 distances, rms", rms(true["distance_um"])),
+                ("scatter of 27 diameters", float(np.std(true["diameter_um"]))),
+                ("sphericity, mean of 27", float(np.mean(true["form_um"]))),
+            )
         ]
     for order in ORDERS:
         if case := found.get(f"standard-3D-best-run1-{order}"):
             rows += [
-                StudyRow(group="One iteration of SART, 3D scan, our matrices", unit="um",
-                         quantity=f"{name}, views in {order} order", best=value)
-                for name, value in (("errors of 351 distances, rms", rms(case["distance_um"])),
-                                    ("sphericity, mean of 27", float(np.mean(case["form_um"]))))
+                StudyRow(
+                    group="One iteration of SART, 3D scan, our matrices",
+                    unit="um",
+                    quantity=f"{name}, views in {order} order",
+                    best=value,
+                )
+                for name, value in (
+                    ("errors of 351 distances, rms", rms(case["distance_um"])),
+                    ("sphericity, mean of 27", float(np.mean(case["form_um"]))),
+                )
             ]
     return rows
 
 
-def calibration_rows(residuals: Mapping[tuple[float, int], tuple[float, float]],
-                     errors: Mapping[tuple[float, int], tuple[float, float]]) -> list[StudyRow]:
+def calibration_rows(
+    residuals: Mapping[tuple[float, int], tuple[float, float]], errors: Mapping[tuple[float, int], tuple[float, float]]
+) -> list[StudyRow]:
     """Residual (px) and error of the 3D scan's matrices (um) of each run, by both methods."""
     rows = []
     for (m, run), pair in residuals.items():
-        rows += [row(f"Calibration at M {m}", f"d_rms_opt, run {run}", *pair, unit="px"),
-                 row(f"Calibration at M {m}", f"error of the 3D scan, run {run}", *errors[m, run],
-                     note="rms at the object's corners, rigid pose removed")]
+        rows += [
+            row(f"Calibration at M {m}", f"d_rms_opt, run {run}", *pair, unit="px"),
+            row(
+                f"Calibration at M {m}",
+                f"error of the 3D scan, run {run}",
+                *errors[m, run],
+                note="rms at the object's corners, rigid pose removed",
+            ),
+        ]
     return rows

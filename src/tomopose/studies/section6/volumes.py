@@ -76,8 +76,14 @@ def matrices_for(case: Case, scan: Scan, found: Mapping[int, Mapping[Method, Cal
 
 
 def volume_for(
-    case: Case, scan: Scan, images: Radiographs, matrices: ProjectionMatrices, numbers: Numbers,
-    options: Mapping[str, Any], checkpoint: FilePath | None, progress: Progress | None,
+    case: Case,
+    scan: Scan,
+    images: Radiographs,
+    matrices: ProjectionMatrices,
+    numbers: Numbers,
+    options: Mapping[str, Any],
+    checkpoint: FilePath | None,
+    progress: Progress | None,
 ) -> Volume:
     """Reconstructed with the options of `reconstruct`; a kept state lets an interrupted one go on.
 
@@ -87,8 +93,17 @@ def volume_for(
     mask = near(case.thing, grid, numbers.edge) if options.get("algorithm") == "fdk" else None
     # The matrices belong to the images by construction, so that other readings need not be tried.
     return reconstruct(
-        images, matrices, grid, white=WHITE, engine="cpu", consistency="off", mask=mask, checkpoint=checkpoint,
-        checkpoint_seconds=CHECKPOINT_SECONDS, progress=progress, **options,
+        images,
+        matrices,
+        grid,
+        white=WHITE,
+        engine="cpu",
+        consistency="off",
+        mask=mask,
+        checkpoint=checkpoint,
+        checkpoint_seconds=CHECKPOINT_SECONDS,
+        progress=progress,
+        **options,
     )
 
 
@@ -116,10 +131,17 @@ def near(thing: Object, grid: VoxelGrid, edge: float) -> np.ndarray:
 
 
 def measured(
-    case: Case, scan: Scan, images: Radiographs, matrices: Callable[[], ProjectionMatrices], numbers: Numbers,
-    options: Mapping[str, Any], steps: Steps, progress: Progress,
+    case: Case,
+    scan: Scan,
+    images: Radiographs,
+    matrices: Callable[[], ProjectionMatrices],
+    numbers: Numbers,
+    options: Mapping[str, Any],
+    steps: Steps,
+    progress: Progress,
 ) -> dict[str, Any]:
     """What is measured in a case's volume, kept as a step."""
+
     def compute() -> dict[str, Any]:
         checkpoint = None if steps.folder is None else steps.folder / f"state-{case.name}"
         volume = volume_for(case, scan, images, matrices(), numbers, options, checkpoint, progress)
@@ -128,6 +150,8 @@ def measured(
         return {**found, "residual": None if residual is None else float(np.median(residual))}
 
     return steps.of(
-        f"volume-{case.name}", compute, options=dict(options),
+        f"volume-{case.name}",
+        compute,
+        options=dict(options),
         numbers={k: v[case.thing] if isinstance(v, Mapping) else v for k, v in asdict(numbers).items() if k != "runs"},
     )
