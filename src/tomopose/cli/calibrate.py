@@ -3,32 +3,18 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tomopose.cli.common import (
-    BallOption,
-    DarkOption,
-    DatasetOption,
-    FlatOption,
-    ForceOption,
-    ImagesOption,
-    JsonOption,
-    ObservationsOption,
-    PosesOption,
-    QuietOption,
-    RawOption,
-    RowsOption,
-    Say,
-    ScannerOption,
-    SourcePosesOption,
-    WorkersOption,
-    arguments,
-    either,
-    names,
-)
+from tomopose.cli.common import BallOption, PosesOption, ScannerOption, SourcePosesOption, arguments, either, names
+from tomopose.cli.options import ObservedOptions, WritingOptions, add_command
+
+if TYPE_CHECKING:
+    from tomopose import BallObservations, Calibration, PoseSequence, Scanner
+    from tomopose.manipulator.twin_file import TwinDrawing
 
 EPILOG = (
     "Example: tomopose calibrate --scanner scanner.json --poses poses.csv --images radiographs/ --out cal/\n\n"
@@ -43,7 +29,61 @@ SCALE_BAR = re.compile(r"(?P<a>\d+),(?P<b>\d+)=(?P<mm>\d+\.?\d*)\((?P<u>\d*\.?\d
 
 
 def register(app: typer.Typer) -> None:
-    app.command("calibrate", epilog=EPILOG)(calibrate)
+    add_command(app, "calibrate", calibrate, epilog=EPILOG)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(ObservedOptions, WritingOptions):
+    """The options of `tomopose calibrate`."""
+
+    scanner: ScannerOption
+    poses: PosesOption
+    out: Annotated[Path, typer.Option("--out", help="Folder for calibration.json, observations.csv, report.html.")]
+    ball_diameter: BallOption = 8.0
+    manipulator: Annotated[
+        Path | None, typer.Option("--manipulator", help="hexapod.json or robot.json: nominal geometry and its priors.")
+    ] = None
+    model: Annotated[
+        str, typer.Option("--model", help="auto, rigid, kinematic or slack: how the manipulator may err.")
+    ] = "auto"
+    free: Annotated[str | None, typer.Option("--free", help="Scanner parameters to estimate too, e.g. d_SR,u_0.")] = (
+        None
+    )
+    fix: Annotated[
+        str | None, typer.Option("--fix", help="Parameters to hold although scanner.json gives them a sigma.")
+    ] = None
+    distance: Annotated[
+        list[str] | None,
+        typer.Option("--distance", help="Scale bar between two balls, ID,ID=MM(U), as in 0,1=25.000(0.001)."),
+    ] = None
+    arrangement: Annotated[
+        str,
+        typer.Option(
+            "--arrangement",
+            help="What the manipulator carries: moving-object, or moving-scanner (source "
+            "and detector; C-arm, gantry), where the ball stands still.",
+        ),
+    ] = "moving-object"
+    distance_sigma: Annotated[
+        float,
+        typer.Option(
+            "--d-sd-sigma-mm",
+            min=0.0,
+            help="With moving-scanner: scatter of d_SD from view to view, one "
+            "more number a view; 0: source and detector are fixed to one another.",
+        ),
+    ] = 0.0
+    twin: Annotated[
+        Path | None,
+        typer.Option(
+            "--twin", help="twin.json: source and detector on a robot each; --poses is then the detector's table."
+        ),
+    ] = None
+    source_poses: SourcePosesOption = None
+
+    @property
+    def moving_scanner(self) -> bool:
+        return self.arrangement == "moving-scanner"
 
 
 def scale_bars(texts: list[str] | None) -> dict[tuple[int, int], tuple[float, float]] | None:
@@ -57,174 +97,130 @@ def scale_bars(texts: list[str] | None) -> dict[tuple[int, int], tuple[float, fl
     return bars or None
 
 
-def require_arrangement(
-    arrangement: str, distance_sigma: float, twin: Path | None, source_poses: Path | None, manipulator: Path | None
-) -> bool:
-    """Whether one manipulator carries the scanner; a usage error where the options contradict one another."""
-    if arrangement not in ARRANGEMENTS:
-        raise typer.BadParameter(f"{arrangement!r} is none of {', '.join(ARRANGEMENTS)}", param_hint="--arrangement")
-    if (twin is None) != (source_poses is None):
-        lost, there = ("--twin", "--source-poses") if twin is None else ("--source-poses", "--twin")
+def require_arrangement(o: Options) -> None:
+    """A usage error where the options contradict one another."""
+    if o.arrangement not in ARRANGEMENTS:
+        raise typer.BadParameter(
+            f"{o.arrangement!r} is unknown; choose one of {', '.join(ARRANGEMENTS)}", param_hint="--arrangement"
+        )
+    if (o.twin is None) != (o.source_poses is None):
+        lost, there = ("--twin", "--source-poses") if o.twin is None else ("--source-poses", "--twin")
         raise typer.BadParameter(
             f"{there} needs {lost}: twin robots have a description and two tables", param_hint=lost
         )
-    moving = arrangement == "moving-scanner"
-    if twin is not None and (manipulator is not None or moving):
+    if o.twin is not None and (o.manipulator is not None or o.moving_scanner):
         raise typer.BadParameter(
             "twin.json names both robots and says what moves; leave out --manipulator and --arrangement",
             param_hint="--twin",
         )
-    if distance_sigma and not moving:
-        raise typer.BadParameter("serves --arrangement moving-scanner", param_hint="--d-sd-sigma-mm")
-    return moving
+    if o.distance_sigma and not o.moving_scanner:
+        raise typer.BadParameter("is used with --arrangement moving-scanner alone", param_hint="--d-sd-sigma-mm")
 
 
-def calibrate(
-    scanner: ScannerOption,
-    poses: PosesOption,
-    out: Annotated[Path, typer.Option("--out", help="Folder for calibration.json, observations.csv, report.html.")],
-    images: ImagesOption = None,
-    observations: ObservationsOption = None,
-    ball_diameter: BallOption = 8.0,
-    manipulator: Annotated[
-        Path | None, typer.Option("--manipulator", help="hexapod.json or robot.json: nominal geometry and its priors.")
-    ] = None,
-    model: Annotated[
-        str, typer.Option("--model", help="auto, rigid, kinematic or slack: how the manipulator may err.")
-    ] = "auto",
-    free: Annotated[
-        str | None, typer.Option("--free", help="Scanner parameters to estimate too, e.g. d_SR,u_0.")
-    ] = None,
-    fix: Annotated[
-        str | None, typer.Option("--fix", help="Parameters to hold although scanner.json gives them a sigma.")
-    ] = None,
-    distance: Annotated[
-        list[str] | None,
-        typer.Option("--distance", help="Scale bar between two balls, ID,ID=MM(U), as in 0,1=25.000(0.001)."),
-    ] = None,
-    arrangement: Annotated[
-        str,
-        typer.Option(
-            "--arrangement",
-            help="What the manipulator carries: moving-object, or moving-scanner (source "
-            "and detector; C-arm, gantry), where the ball stands still.",
-        ),
-    ] = "moving-object",
-    distance_sigma: Annotated[
-        float,
-        typer.Option(
-            "--d-sd-sigma-mm",
-            min=0.0,
-            help="With moving-scanner: scatter of d_SD from view to view, one "
-            "more number a view; 0: source and detector are fixed to one another.",
-        ),
-    ] = 0.0,
-    twin: Annotated[
-        Path | None,
-        typer.Option(
-            "--twin", help="twin.json: source and detector on a robot each; --poses is then the detector's table."
-        ),
-    ] = None,
-    source_poses: SourcePosesOption = None,
-    dark: DarkOption = None,
-    flat: FlatOption = None,
-    dataset: DatasetOption = None,
-    rows: RowsOption = None,
-    raw: RawOption = None,
-    workers: WorkersOption = 1,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> int:
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """What the files of a calibration hold.  images: the open stack, None where observations were read."""
+
+    scanner: Scanner
+    poses: PoseSequence
+    observations: BallObservations
+    images: Any
+    manipulator: Any
+    twin: TwinDrawing | None
+
+
+def read_inputs(o: Options) -> Inputs:
+    """Read every file that the options name, and find the ball where images are given."""
+    import tomopose as tp
+    from tomopose.cli.job import forward_of, image_source, note_missing_flat, observe, open_for
+    from tomopose.manipulator.twin_file import read_twin
+
+    scanner = tp.read_scanner(o.scanner)
+    manipulator = None if o.manipulator is None else tp.read_manipulator(o.manipulator)
+    twin = None if o.twin is None else read_twin(o.twin)
+    # A table of joint values alone becomes poses by the robot's own kinematics.
+    poses = tp.read_poses(o.poses, forward=forward_of(manipulator if twin is None else twin.detector))
+    images = None
+    if o.observations is not None:
+        observations = tp.read_observations(o.observations)
+    else:
+        images = open_for(
+            o.say, image_source(str(o.images)), scanner, poses,
+            dark=o.dark, flat=o.flat, dataset=o.dataset, rows=o.rows, raw=o.raw,
+        )  # fmt: skip
+        note_missing_flat(o.say, o.flat)
+        observations = observe(o.say, scanner, images, poses, ball_diameter=o.ball_diameter, workers=o.workers)
+    return Inputs(
+        scanner=scanner, poses=poses, observations=observations, images=images, manipulator=manipulator, twin=twin
+    )
+
+
+def solve(o: Options, given: Inputs) -> Calibration:
+    """The calibration of the arrangement; where no optimum was reached, what was reached (it is rejected)."""
+    import tomopose as tp
+    from tomopose.cli.job import forward_of
+    from tomopose.errors import NotConvergedError
+
+    scanner, poses, observations = given.scanner, given.poses, given.observations
+    settings: dict[str, Any] = {
+        "model": o.model, "free": names(o.free), "fix": names(o.fix), "distances": scale_bars(o.distance),
+    }  # fmt: skip
+    try:
+        if given.twin is not None and o.source_poses is not None:
+            robots = given.twin.robots(tp.read_poses(o.source_poses, forward=forward_of(given.twin.source)))
+            mount = given.twin.mount(scanner)
+            return tp.calibrate_twin(scanner, poses, observations, twin=robots, mount=mount, **settings)
+        if o.moving_scanner:
+            return tp.calibrate_inverse(
+                scanner, poses, observations, manipulator=given.manipulator, d_SD_sigma=o.distance_sigma, **settings
+            )
+        return tp.calibrate(scanner, poses, observations, manipulator=given.manipulator, **settings)
+    except NotConvergedError as error:
+        if not isinstance(error.calibration, tp.Calibration):
+            raise
+        return error.calibration
+
+
+def calibrate(options: Options) -> int:
     """Find how the manipulator sits in the scanner.  No start value is needed.
 
     Exit code 3 says that the calibration finished but is not trustworthy; the report leads with the reasons.
     """
-    from dataclasses import replace
-
     import tomopose as tp
     from tomopose.calibration.checks.ball_size import require_ball_size, size_ratio
-    from tomopose.cli.job import (
-        calibration_summary,
-        exit_code,
-        forward_of,
-        image_source,
-        note_missing_flat,
-        observe,
-        open_for,
-        require_free_folder,
-        write_calibration_folder,
-    )
-    from tomopose.errors import NotConvergedError
-    from tomopose.manipulator.twin_file import read_twin
+    from tomopose.cli.job import calibration_summary, exit_code, require_free_folder, write_calibration_folder
     from tomopose.provenance import provenance
 
-    either(images, observations)
-    moving = require_arrangement(arrangement, distance_sigma, twin, source_poses, manipulator)
-    say = Say(json=as_json, quiet=quiet)
-    require_free_folder(out, force=force)
-    bars = scale_bars(distance)
-    geometry = tp.read_scanner(scanner)
-    errors = None if manipulator is None else tp.read_manipulator(manipulator)
-    twins = None if twin is None else read_twin(twin)
-    # A table of joint values alone becomes poses by the robot's own kinematics.
-    sequence = tp.read_poses(poses, forward=forward_of(errors if twins is None else twins.detector))
-    stack = None
-    if observations is not None:
-        observed = tp.read_observations(observations)
-    else:
-        stack = open_for(
-            say,
-            image_source(str(images)),
-            geometry,
-            sequence,
-            dark=dark,
-            flat=flat,
-            dataset=dataset,
-            rows=rows,
-            raw=raw,
-        )
-        note_missing_flat(say, flat)
-        observed = observe(say, geometry, stack, sequence, ball_diameter=ball_diameter, workers=workers)
-    given: dict[str, Any] = {"model": model, "free": names(free), "fix": names(fix), "distances": bars}
-    try:
-        if twins is not None and source_poses is not None:
-            robots = twins.robots(tp.read_poses(source_poses, forward=forward_of(twins.source)))
-            result = tp.calibrate_twin(geometry, sequence, observed, twin=robots, mount=twins.mount(geometry), **given)
-        elif moving:
-            result = tp.calibrate_inverse(
-                geometry, sequence, observed, manipulator=errors, d_SD_sigma=distance_sigma, **given
-            )
-        else:
-            result = tp.calibrate(geometry, sequence, observed, manipulator=errors, **given)
-    except NotConvergedError as error:
-        # what was reached is rejected, and its report says why
-        if not isinstance(error.calibration, tp.Calibration):
-            raise
-        result = error.calibration
-    # where the scanner moves, the chain runs through the inverse poses
-    shown = tp.inverse_poses(sequence) if moving or twins is not None else sequence
-    if stack is not None and twins is None and result.verdict != "rejected":
-        size = require_ball_size(size_ratio(result, shown, observed, ball_diameter), ball_diameter)
+    o = options
+    either(o.images, o.observations)
+    require_arrangement(o)
+    require_free_folder(o.out, force=o.force)
+    scale_bars(o.distance)
+    given = read_inputs(o)
+    result = solve(o, given)
+    # Where the scanner moves, the chain runs through the inverse poses.
+    shown = tp.inverse_poses(given.poses) if o.moving_scanner or given.twin is not None else given.poses
+    if given.images is not None and given.twin is None and result.verdict != "rejected":
+        size = require_ball_size(size_ratio(result, shown, given.observations, o.ball_diameter), o.ball_diameter)
         if size:
-            say.note(f"note: {size}")
+            o.say.note(f"note: {size}")
     made = provenance(
-        inputs=[scanner, poses, *(p for p in (observations, manipulator, twin, source_poses) if p is not None)],
+        inputs=[p for p in (o.scanner, o.poses, o.observations, o.manipulator, o.twin, o.source_poses) if p],
         arguments=arguments(
-            model=model,
-            free=free,
-            fix=fix,
-            distance=distance,
-            ball_diameter_mm=ball_diameter,
-            images=None if images is None else len(observed),
-            arrangement="twin" if twins is not None else arrangement,
-            d_sd_sigma_mm=distance_sigma or None,
+            model=o.model,
+            free=o.free,
+            fix=o.fix,
+            distance=o.distance,
+            ball_diameter_mm=o.ball_diameter,
+            images=None if o.images is None else len(given.observations),
+            arrangement="twin" if given.twin is not None else o.arrangement,
+            d_sd_sigma_mm=o.distance_sigma or None,
         ),
     )
     result = replace(result, provenance=made)
-    write_calibration_folder(out, result, observed, shown, images=stack, force=force)
+    write_calibration_folder(o.out, result, given.observations, shown, images=given.images, force=o.force)
     summary, lines = calibration_summary(result)
     if "kind" in result.manipulator:
         lines += [f"  {note}" for note in result.observability.notes]
-    say.result({"out": out.name, **summary}, [*lines, f"{out}: calibration.json, observations.csv, report.html"])
+    o.say.result({"out": o.out.name, **summary}, [*lines, f"{o.out}: calibration.json, observations.csv, report.html"])
     return exit_code(result)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import typer
 
 from tomopose.cli import plan_poses, plan_scan
+from tomopose.cli.options import add_command
 
 app_plan = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", help="Plan calibration poses and scans.")
 
 
 def register(app: typer.Typer) -> None:
-    app_plan.command("poses", epilog=plan_poses.EPILOG)(plan_poses.poses)
+    add_command(app_plan, "poses", plan_poses.poses, epilog=plan_poses.EPILOG)
     app_plan.command("scan", epilog=plan_scan.EPILOG)(plan_scan.scan)
     app.add_typer(app_plan, name="plan")
