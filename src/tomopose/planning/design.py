@@ -32,6 +32,10 @@ SIGMA_PX = 0.0207 / np.sqrt(2.0)
 BALL_MM = (10.0, -8.0, 16.0)
 """A ball 20 mm off the pivot in no special direction: on the pivot, rotations could not be told from one another."""
 
+TRADED = 0.5
+"""Share of the largest weight in an undetermined direction from which a coordinate is named: the coordinates that trade
+with one another have equal weights once each is scaled by its own information."""
+
 MOST_IMAGES = 400
 RESOLVING_ROUNDS = 8
 
@@ -237,10 +241,13 @@ def _require_determined(L: Array, prior: Array, target: ScanTarget) -> None:
     scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
     value, V = np.linalg.eigh(N * scale[:, None] * scale)
     if value[0] < 1e-12:
-        worst = target.names[int(np.abs(V[:, 0]).argmax())]
+        weight = np.abs(V[:, 0])
+        # Coordinates that trade with one another have weights that rounding alone orders: all of them are named.
+        shared = [n for n, w in zip(target.names, weight, strict=True) if w > TRADED * weight.max()]
         raise NotObservableError(
-            f"no poses within these limits determine {worst}; allow more table angles or travel, or give it a prior",
-            direction=worst,
+            f"no poses within these limits determine {', '.join(shared)}; allow more table angles or travel, or give "
+            "one of them a prior",
+            direction=", ".join(shared),
             singular_values=np.sqrt(np.maximum(value[::-1], 0.0)).tolist(),
         )
 
