@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from tomopose.kept import StartsAnewWarning
 from tomopose.studies.parts.steps import Steps, sources
 
 
@@ -22,14 +24,20 @@ def test_a_kept_step_is_not_computed_again_and_gives_the_same_numbers(tmp_path):
 
 def test_another_key_is_computed_anew(tmp_path):
     assert Steps(folder=tmp_path, key={"seed": 1}).of("one", lambda: {"x": 1}) == {"x": 1}
-    assert Steps(folder=tmp_path, key={"seed": 2}).of("one", lambda: {"x": 2}) == {"x": 2}
-    assert Steps(folder=tmp_path, key={"seed": 2}).of("one", lambda: {"x": 3}, poses=[1.0]) == {"x": 3}
+    with pytest.warns(StartsAnewWarning, match="seed was 1, now 2"):
+        assert Steps(folder=tmp_path, key={"seed": 2}).of("one", lambda: {"x": 2}) == {"x": 2}
+    with pytest.warns(StartsAnewWarning, match="poses is new"):
+        assert Steps(folder=tmp_path, key={"seed": 2}).of("one", lambda: {"x": 3}, poses=[1.0]) == {"x": 3}
+    poses = np.array([1.0, np.nextafter(1.0, 2.0)])
+    with pytest.warns(StartsAnewWarning, match="poses changed"):
+        assert Steps(folder=tmp_path, key={"seed": 2}).of("one", lambda: {"x": 4}, poses=poses) == {"x": 4}
 
 
 def test_half_a_file_is_computed_anew(tmp_path):
     steps = Steps(folder=tmp_path)
     (tmp_path / "one.json").write_text('{"schema": "tomopose/study-step/1", "key":')
-    assert steps.of("one", lambda: {"x": 4}) == {"x": 4}
+    with pytest.warns(StartsAnewWarning, match="no readable key"):
+        assert steps.of("one", lambda: {"x": 4}) == {"x": 4}
     assert Steps(folder=tmp_path).of("one", lambda: {"x": 5}) == {"x": 4}
 
 
@@ -40,7 +48,8 @@ def test_a_step_of_other_code_is_computed_anew(tmp_path, monkeypatch):
     compute.__module__ = "tomopose.studies.tuy"
     assert Steps(folder=tmp_path).of("one", compute) == {"x": 1}
     monkeypatch.setattr("tomopose.studies.parts.steps.sources", lambda module: "other")
-    assert Steps(folder=tmp_path).of("one", lambda: {"x": 2}) == {"x": 2}
+    with pytest.warns(StartsAnewWarning, match="sources"):
+        assert Steps(folder=tmp_path).of("one", lambda: {"x": 2}) == {"x": 2}
 
 
 def test_sources_are_those_that_a_module_imports(monkeypatch, tmp_path):

@@ -39,7 +39,7 @@ def simulate(
     form: Annotated[Form, typer.Option("--format", help="TIFF files in radiographs/, or radiographs.h5.")] = Form.tiff,
     workers: WorkersOption = 1,
     dask: DaskOption = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Keep the radiographs that are there already.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Keep this scene's radiographs that are there.")] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,

@@ -6,9 +6,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tomopose.cli.common import Progress
+
+if TYPE_CHECKING:
+    from tomopose.kept import Key
 
 RADIOGRAPHS, STACK = "radiographs", "radiographs.h5"
 
@@ -60,12 +63,16 @@ def write_run(
     progress: Progress | None = None,
 ) -> None:
     """Tables first, then the images one by one: TIFF files, each whole or absent, or the stack of one HDF5 file, which
-    bears another name until it is whole.  Both can be resumed."""
+    bears another name until it is whole.
+
+    truth.json holds the run's key.  Images that are there already stay only where it is this run's (`resume`); those of
+    another run are removed before anything of this one is written, so that the folder never mixes two.
+    """
     import tomopose as tp
-    from tomopose.errors import InputError
     from tomopose.files import require_absent, write_json
     from tomopose.io.images.stack import append_hdf5, frames_kept
     from tomopose.provenance import provenance
+    from tomopose.simulation.run import run_key
 
     n, rows = len(run), run.scanner.image_rows
     stack = out / STACK
@@ -74,29 +81,62 @@ def write_run(
     tables = [out / name for name in ("scanner.json", "poses.csv", "truth.json")]
     for path in (*tables, *(paths if not resume else ())):
         require_absent(path, force=force or resume)
+    key = run_key(run, form=form)
+    clear_another_run(out, key, force=force)
     tp.write_scanner(tables[0], run.scanner, force=True)
     tp.write_poses(tables[1], replace(run.poses, image=tuple(names)), force=True)
     made = provenance(inputs=inputs, seed=run.seed)
-    write_json(tables[2], "truth", {**run.truth(), "provenance": made.to_json()})
+    write_json(tables[2], "truth", {**run.truth(), "key": key.to_json(), "provenance": made.to_json()})
 
     def told(finished: int) -> None:
         if progress is not None:
             progress(finished, n)
 
     if form == "hdf5":
-        kept = frames_kept(stack) if resume else 0
-        if resume and stack.exists() and kept != n:
-            raise InputError(f"{stack} is whole with {kept} frames; this scene has {n}: it cannot be gone on with")
+        whole = resume and stack.exists()
+        kept = n if whole else frames_kept(stack, key) if resume else 0
         told(kept)
-        if kept < n:
+        if not whole:
             made_now = frames(run, range(kept, n), workers=workers, client=client)
-            append_hdf5(stack, _told(made_now, kept, told), kept, rows)
+            append_hdf5(stack, _told(made_now, kept, told), count=n, key=key, rows=rows, kept=kept)
         return
     missing = [k for k, path in enumerate(paths) if not (resume and path.exists())]
     done = n - len(missing)
     told(done)
     for k, image in _told(frames(run, missing, workers=workers, client=client), done, told):
         tp.write_tiff(paths[k], image, rows=rows, force=True)
+
+
+def clear_another_run(out: Path, key: Key, *, force: bool) -> None:
+    """Remove the radiographs of another run from a folder; StartsAnewWarning says what differs.
+
+    FileError where there are radiographs without the key of a simulated run and `force` is not given: they may be
+    anybody's.
+    """
+    from tomopose.errors import FileError
+    from tomopose.files import read_json
+    from tomopose.io.images.stack import partial, remove_stack
+    from tomopose.kept import Key, same_key
+
+    stack = out / STACK
+    images = sorted((out / RADIOGRAPHS).glob("pose_*.tif"))
+    if not images and not stack.exists() and not partial(stack).exists():
+        return
+    try:
+        kept = Key.from_json(read_json(out / "truth.json", "truth").get("key"))
+    except FileError:
+        kept = None
+    if kept is None and not force:
+        raise FileError(
+            f"{out} holds radiographs, but no truth.json says which simulated run they belong to; give another folder, "
+            "or --force to replace them",
+            path=out,
+        )
+    if same_key(kept, key, what=f"the simulated run in {out}"):
+        return
+    for image in images:
+        image.unlink(missing_ok=True)
+    remove_stack(stack)
 
 
 def _told(made: Iterator[tuple[int, Any]], done: int, told: Callable[[int], None]) -> Iterator[tuple[int, Any]]:

@@ -15,7 +15,9 @@ from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import project_ball
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.kept import Key, key_of
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.provenance import package_version
 from tomopose.simulation.detector.blur import margin, to_pixels
 from tomopose.simulation.detector.detector import Detector, expose
 from tomopose.simulation.detector.scatter_glare_mtf import with_glare, with_mtf, with_scatter
@@ -146,6 +148,12 @@ class SimulatedRun:
                 ],
             }
         return document
+
+
+def run_key(run: SimulatedRun, *, form: str) -> Key:
+    """Everything that the bytes of a run's images depend on, and the form of the files ("tiff", "hdf5")."""
+    engine = package_version("gvxr") if run.engine == "gvxr" else None
+    return key_of("simulated-run", form=form, gvxr=engine, **{f.name: getattr(run, f.name) for f in fields(run)})
 
 
 def _run(values: dict[str, Any]) -> SimulatedRun:

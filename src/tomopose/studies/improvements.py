@@ -259,7 +259,7 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
     for k, name in enumerate(CASES):
         found = []
         for s in range(seeds):
-            found.append(steps.of(f"case-{k}-{s}", lambda name=name, s=s: solve_case(name, seed + s)))  # type: ignore[misc]
+            found.append(steps.of(f"case-{k}-{s}", lambda name=name, s=s: solve_case(name, seed + s), case=name))  # type: ignore[misc]
             progress(k * seeds + s + 1, len(CASES) * seeds)
         rigid, best, u = (float(np.sqrt(np.mean([f[side] ** 2 for f in found]))) for side in ("rigid", "best", "u"))
         rows.append(

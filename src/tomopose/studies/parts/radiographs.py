@@ -134,9 +134,7 @@ def measure_run(run: BallRun, steps: Steps, name: str, progress: Progress) -> Me
             steps.of(
                 f"{name}-{c}",
                 lambda part=part, count=count: _measure_chunk(part, count),  # type: ignore[misc]
-                poses=part.x_D,
-                seed=part.seed,
-                snr=part.snr,
+                run=part,
             )
         )
         progress(int(rows[-1]) + 1, n)

@@ -17,7 +17,7 @@ from typing import Any
 
 from tomopose.errors import FileError
 from tomopose.files import plain, read_json, write_json
-from tomopose.provenance import package_version
+from tomopose.kept import Key, key_of, same_key
 
 SCHEMA_NAME = "study-step"
 PACKAGE = Path(__file__).resolve().parents[2]
@@ -53,37 +53,29 @@ def sources(module: str) -> str:
 @dataclass(frozen=True, kw_only=True)
 class Steps:
     """folder: where steps are kept, or None to keep none.  key: what a kept step must have been made with (study,
-    scale, seed ...); a step of another key is made again."""
+    scale, seed ...); a step of another key is made again, and StartsAnewWarning says so."""
 
     folder: Path | None = None
-    key: Mapping[str, Any] = field(default_factory=dict)
+    key: Mapping[str, object] = field(default_factory=dict)
 
-    def of(self, name: str, compute: Callable[[], Mapping[str, Any]], **key: Any) -> dict[str, Any]:
+    def of(self, name: str, compute: Callable[[], Mapping[str, Any]], **settings: object) -> dict[str, Any]:
         """The content of a step: kept from an earlier run with the same key and code, or computed (and kept) now.
+
+        settings: what this step depends on beside the key of all steps, arrays and values whole.
 
         The content is plain JSON, also where nothing is kept, so that a resumed run gives the same numbers.
         """
-        wanted = json.loads(
-            json.dumps(
-                plain(
-                    {
-                        "version": package_version(),
-                        "sources": sources(compute.__module__),
-                        **self.key,
-                        **key,
-                    }
-                )
-            )
-        )
+        key = key_of("study-step", sources=sources(compute.__module__), **self.key, **settings)
         path = None if self.folder is None else self.folder / f"{name}.json"
         if path is not None and path.exists():
             try:
                 kept = read_json(path, SCHEMA_NAME)
             except FileError:
                 kept = {}  # half of a file of another making: it is made again
-            if kept.get("key") == wanted and isinstance(kept.get("content"), dict):
+            belongs = same_key(Key.from_json(kept.get("key")), key, what=f"the kept step {path}")
+            if belongs and isinstance(kept.get("content"), dict):
                 return dict(kept["content"])
         content = plain(compute())
         if path is not None:
-            write_json(path, SCHEMA_NAME, {"key": wanted, "content": content})
+            write_json(path, SCHEMA_NAME, {"key": key.to_json(), "content": content})
         return dict(json.loads(json.dumps(content)))

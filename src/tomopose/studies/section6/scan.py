@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
@@ -16,6 +15,7 @@ from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
 from tomopose.geometry.rotations import R_y
 from tomopose.geometry.scanner import Scanner
+from tomopose.kept import Key, key_of
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.simulation.objects.mesh import Mesh, MeshSolid
 from tomopose.simulation.objects.specimen import specimen_mesh
@@ -170,7 +170,9 @@ class Radiographs(Sequence[Any]):
         self._seeds = np.random.SeedSequence(scan.seed).generate_state(len(scan.poses))
         shape = (len(scan.poses), scan.truth.n_v, scan.truth.n_u)
         large = 2 * np.prod(shape) > MOST_KEPT_BYTES
-        self.file = folder / f"frames-{scan.thing}-{scan.path}-{fingerprint(scan)}.npy" if folder and large else None
+        self.file = (
+            folder / f"frames-{scan.thing}-{scan.path}-{frames_key(scan).digest[:16]}.npy" if folder and large else None
+        )
         self._kept: Any = None if large else np.zeros(shape, dtype=np.uint16)
         if self.file is not None:
             self.file.parent.mkdir(parents=True, exist_ok=True)
@@ -205,8 +207,6 @@ class Radiographs(Sequence[Any]):
             self.file.unlink(missing_ok=True)
 
 
-def fingerprint(scan: Scan) -> str:
+def frames_key(scan: Scan) -> Key:
     """Of all that a scan's frames depend on."""
-    digest = hashlib.sha256(np.ascontiguousarray(scan.truth.P).tobytes())
-    digest.update(f"{scan.samples} {scan.edge} {scan.seed} {sources(__name__)}".encode())
-    return digest.hexdigest()[:12]
+    return key_of("study-frames", scan=scan, mu=attenuation_of(scan.thing), sources=sources(__name__))
