@@ -23,7 +23,7 @@ from tomopose import PoseSequence, RigidTransform, Scanner
 from tomopose.geometry.frames import Frame
 from tomopose.simulation.detector.detector import Detector, expose
 from tomopose.simulation.detector.noise import add_photon_noise, frame_key
-from tomopose.simulation.objects.mesh import Mesh, MeshSolid, mesh_paths
+from tomopose.simulation.objects.mesh import MeshSolid, TriangleMesh, mesh_paths
 from tomopose.simulation.objects.shapes import Solid, sphere
 from tomopose.simulation.objects.specimen import specimen_mesh
 from tomopose.simulation.objects.sphere_standard import multi_sphere_standard
@@ -120,7 +120,7 @@ def paths() -> Iterator[Row]:
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=7, radius=2.5)
-    solid = MeshSolid(mesh=Mesh(vertices=ball.vertices, faces=ball.faces), material="Al")
+    solid = MeshSolid(mesh=TriangleMesh(vertices=ball.vertices, faces=ball.faces), material="Al")
     o = np.array([283.5, 0.0, 0.0])
     target = rng.uniform(-2.6, 2.6, (500_000, 3)) * [0, 1, 1]
     error = (

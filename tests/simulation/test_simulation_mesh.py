@@ -10,7 +10,7 @@ import pytest
 from tomopose import PoseSequence, RigidTransform, Scanner
 from tomopose.errors import EngineFailedError, FileError, InputError
 from tomopose.geometry.frames import Frame
-from tomopose.simulation.objects.mesh import Mesh, MeshSolid, mesh_paths, read_mesh, write_stl
+from tomopose.simulation.objects.mesh import MeshSolid, TriangleMesh, mesh_paths, read_mesh, write_stl
 from tomopose.simulation.objects.shapes import Solid, box, cone, cylinder, half_space, sphere, torus
 from tomopose.simulation.objects.specimen import LENGTH, measurands, specimen_mesh
 from tomopose.simulation.objects.tessellate import tessellate
@@ -22,7 +22,7 @@ from tomopose.simulation.run import simulate_ball_run, transmission
 pytest.importorskip("embreex")
 pytest.importorskip("manifold3d")
 
-CUBE = Mesh(
+CUBE = TriangleMesh(
     vertices=np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float),
     faces=np.array(
         [
@@ -47,11 +47,13 @@ def ball(times):
     """An octahedron's faces cut in four `times` times, all corners on the sphere of radius 2.5 mm."""
     v = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float)
     f = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
-    mesh = Mesh(vertices=v, faces=f)
+    mesh = TriangleMesh(vertices=v, faces=f)
     for _ in range(times):
         mesh = mesh.refined()
-        mesh = Mesh(vertices=mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True), faces=mesh.faces)
-    return Mesh(vertices=2.5 * mesh.vertices, faces=mesh.faces)
+        mesh = TriangleMesh(
+            vertices=mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True), faces=mesh.faces
+        )
+    return TriangleMesh(vertices=2.5 * mesh.vertices, faces=mesh.faces)
 
 
 def aimed(rng, n, reach):
@@ -119,7 +121,9 @@ def test_rays_through_corners_of_a_mesh_never_slip_through():
     near = np.concatenate([quads[:, [0, 2, 1]], quads[:, [0, 3, 2]]])
     walls = [[p, q, q + 81] for p, q in zip(rim, rim[1:] + rim[:1], strict=True)]
     walls += [[p, q + 81, p + 81] for p, q in zip(rim, rim[1:] + rim[:1], strict=True)]
-    mesh = Mesh(vertices=np.concatenate([low, 1.25 * low]), faces=np.concatenate([near, near[:, ::-1] + 81, walls]))
+    mesh = TriangleMesh(
+        vertices=np.concatenate([low, 1.25 * low]), faces=np.concatenate([near, near[:, ::-1] + 81, walls])
+    )
     image = mesh_path_image(
         (MeshSolid(mesh=mesh, material="Al", frame=Frame.W),),
         view,
@@ -150,11 +154,11 @@ def test_the_edge_of_a_mesh_lies_where_the_shape_s_does():
 
 def test_open_and_inverted_meshes_are_refused():
     with pytest.raises(InputError, match="not closed"):
-        MeshSolid(mesh=Mesh(vertices=CUBE.vertices, faces=CUBE.faces[:-1]), material="Al")
+        MeshSolid(mesh=TriangleMesh(vertices=CUBE.vertices, faces=CUBE.faces[:-1]), material="Al")
     with pytest.raises(InputError, match="inwards"):
-        MeshSolid(mesh=Mesh(vertices=CUBE.vertices, faces=CUBE.faces[:, ::-1]), material="Al")
+        MeshSolid(mesh=TriangleMesh(vertices=CUBE.vertices, faces=CUBE.faces[:, ::-1]), material="Al")
     with pytest.raises(InputError):
-        Mesh(vertices=CUBE.vertices, faces=np.array([[0, 1, 99]]))
+        TriangleMesh(vertices=CUBE.vertices, faces=np.array([[0, 1, 99]]))
     # Unequal numbers of entries and exits never become a path.
     solid = MeshSolid(mesh=CUBE, material="Al")
     solid.tracer.normal[:] = np.abs(solid.tracer.normal)

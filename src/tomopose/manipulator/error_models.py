@@ -47,7 +47,7 @@ COMMAND_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
-class Correction:
+class PoseCorrection:
     """Corrected poses and what is known about them.
 
     poses:    the table with T_MH of the real plate.
@@ -157,20 +157,20 @@ def _executed(
     return replace(real, J=J), (*model.names, *worn.names[still.stop :])
 
 
-def correction(manipulator: Mapping[str, Any], poses: PoseSequence) -> Correction:
+def correction(manipulator: Mapping[str, Any], poses: PoseSequence) -> PoseCorrection:
     """The table with the poses of the real plate, its Jacobian and what lies outside the calibrated range.
 
     A block without a machine (a rigid calibration) leaves the poses as they are.
     """
     n = len(poses)
     if "kind" not in manipulator:
-        return Correction(poses=poses, J=np.zeros((n, 6, 0)), names=(), outside=np.zeros(n, dtype=bool))
+        return PoseCorrection(poses=poses, J=np.zeros((n, 6, 0)), names=(), outside=np.zeros(n, dtype=bool))
     real, names = _executed(manipulator, poses, poses)
     scale = float(manipulator.get("translation_scale", 1.0))
     T_MH = replace(real.T_MH, t=scale * real.t)
     J = np.concatenate([real.J[:, :3], scale * real.J[:, 3:]], axis=1)
     outside = outside_range(manipulator["range"], poses)
-    return Correction(
+    return PoseCorrection(
         poses=replace(poses, T_MH=T_MH), J=J, names=names, outside=outside, notes=outside_notes(outside, poses)
     )
 

@@ -22,7 +22,7 @@ from tomopose.simulation.detector.blur import margin, to_pixels
 from tomopose.simulation.detector.detector import Detector, expose
 from tomopose.simulation.detector.scatter_glare_mtf import with_glare, with_mtf, with_scatter
 from tomopose.simulation.objects.ball import ball_in_holder, ball_positions, silhouette_centre
-from tomopose.simulation.objects.mesh import Mesh, MeshSolid
+from tomopose.simulation.objects.mesh import MeshSolid, TriangleMesh
 from tomopose.simulation.objects.shapes import Solid
 from tomopose.simulation.physics.materials import MATERIALS, Material
 from tomopose.simulation.physics.spectrum import Beam, Spectrum, condense, tube_spectrum
@@ -103,7 +103,7 @@ class SimulatedRun:
         return condense(self.spectrum, self.beam_materials, list(longest.values()), self.materials)
 
     @functools.cached_property
-    def tessellated(self) -> list[tuple[Mesh, str, Frame]]:
+    def tessellated(self) -> list[tuple[TriangleMesh, str, Frame]]:
         """(mesh, material, frame) of all that is imaged, for engines that know only triangles."""
         from tomopose.simulation.objects.tessellate import tessellate
 

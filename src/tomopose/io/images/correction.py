@@ -15,7 +15,7 @@ TRANSMISSION_LIMIT = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Correction:
+class FlatField:
     """dark and gain = 1 / (F - D), float32, and bad, bool, each (n_v, n_u)."""
 
     dark: Image
@@ -28,7 +28,7 @@ class Correction:
         return (part.astype(np.float32) - self.dark[where]) * self.gain[where]
 
 
-def correction(dark: Image | None, flat: Image | None, bad_pixels: Image | None, shape: tuple[int, int]) -> Correction:
+def correction(dark: Image | None, flat: Image | None, bad_pixels: Image | None, shape: tuple[int, int]) -> FlatField:
     """The correction with mean dark and flat images [v, u] (dark 0 and flat 1 where there are none).
 
     Pixels where F - D <= 0 or is not finite are bad; so are those of `bad_pixels`.  InputError where a shape does not
@@ -51,7 +51,7 @@ def correction(dark: Image | None, flat: Image | None, bad_pixels: Image | None,
     gain = np.full(shape, np.nan, np.float32)
     gain[~bad] = 1.0 / span[~bad]
     bad.setflags(write=False)
-    return Correction(dark=D.astype(np.float32), gain=gain, bad=bad)
+    return FlatField(dark=D.astype(np.float32), gain=gain, bad=bad)
 
 
 def require_uncorrected(first: Image, flat: Image) -> None:

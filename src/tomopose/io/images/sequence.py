@@ -13,7 +13,7 @@ from typing import Any, Literal, overload
 import numpy as np
 
 from tomopose.errors import InputError
-from tomopose.io.images.correction import Correction
+from tomopose.io.images.correction import FlatField
 from tomopose.io.images.frames import FrameSource, Image
 
 Rows = Literal["top-first", "bottom-first"]
@@ -33,7 +33,7 @@ class ImageSequence:
     source: FrameSource
     rows: Rows
     index: tuple[int, ...]
-    correction: Correction | None = None
+    correction: FlatField | None = None
     bad_pixels: Image | None = None
     warnings: tuple[str, ...] = field(default=())
 

@@ -28,7 +28,7 @@ RETRIES = 16
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Mesh:
+class TriangleMesh:
     """vertices (n, 3), mm; faces (m, 3), counter-clockwise seen from outside; the surface is closed."""
 
     vertices: Array
@@ -52,7 +52,7 @@ class Mesh:
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
-    def require_closed(self) -> Mesh:
+    def require_closed(self) -> TriangleMesh:
         """This mesh, if every edge has two faces that agree on the outside; InputError otherwise."""
         edges = np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]]).astype(np.int64)
         n = len(self.vertices)
@@ -64,12 +64,12 @@ class Mesh:
             raise InputError(f"the mesh's faces look inwards (volume {self.volume:g} mm^3); turn them round")
         return self
 
-    def placed(self, *, R: Any = None, t: Any = (0.0, 0.0, 0.0)) -> Mesh:
+    def placed(self, *, R: Any = None, t: Any = (0.0, 0.0, 0.0)) -> TriangleMesh:
         """The mesh after x -> R x + t (mm)."""
         R = np.eye(3) if R is None else np.asarray(R, dtype=np.float64)
-        return Mesh(vertices=self.vertices @ R.T + np.asarray(t, dtype=np.float64), faces=self.faces)
+        return TriangleMesh(vertices=self.vertices @ R.T + np.asarray(t, dtype=np.float64), faces=self.faces)
 
-    def refined(self) -> Mesh:
+    def refined(self) -> TriangleMesh:
         """Every triangle cut in four."""
         n = len(self.vertices)
         pairs = np.sort(np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]]), axis=1)
@@ -77,7 +77,7 @@ class Mesh:
         ab, bc, ca = (n + where.reshape(3, -1)).astype(np.int32)
         a, b, c = self.faces.T
         faces = np.concatenate([np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
-        return Mesh(vertices=np.concatenate([self.vertices, self.vertices[unique].mean(axis=1)]), faces=faces)
+        return TriangleMesh(vertices=np.concatenate([self.vertices, self.vertices[unique].mean(axis=1)]), faces=faces)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,7 +85,7 @@ class MeshSolid:
     """A closed mesh filled with a material and fixed to a frame: M, H, T or W.  Meshes must not overlap other
     solids."""
 
-    mesh: Mesh
+    mesh: TriangleMesh
     material: str
     frame: Frame = Frame.M
     name: str = ""
@@ -111,14 +111,14 @@ class MeshSolid:
         return self._cache["tracer"]
 
 
-def _mesh_solid(mesh: Mesh, material: str, frame: Frame, name: str) -> MeshSolid:
+def _mesh_solid(mesh: TriangleMesh, material: str, frame: Frame, name: str) -> MeshSolid:
     return MeshSolid(mesh=mesh, material=material, frame=frame, name=name)
 
 
 class Tracer:
     """The search tree of one mesh.  Coordinates are taken from the mesh's middle, so that float32 has small numbers."""
 
-    def __init__(self, mesh: Mesh) -> None:
+    def __init__(self, mesh: TriangleMesh) -> None:
         try:
             from embreex.mesh_construction import TriangleMesh
             from embreex.rtcore_scene import EmbreeScene
@@ -201,7 +201,7 @@ def mesh_paths(solid: MeshSolid, o: Array, d: Array) -> Array:
 
 
 @functools.lru_cache(maxsize=4)
-def _load(path: str, scale: float) -> Mesh:
+def _load(path: str, scale: float) -> TriangleMesh:
     try:
         import trimesh
     except ImportError as error:
@@ -210,17 +210,17 @@ def _load(path: str, scale: float) -> Mesh:
         loaded: Any = trimesh.load(path, force="mesh", process=True)
     except Exception as error:
         raise FileError(f"{path} cannot be read as a mesh: {error}", path=path) from error
-    return Mesh(vertices=np.asarray(loaded.vertices) * scale, faces=np.asarray(loaded.faces)).require_closed()
+    return TriangleMesh(vertices=np.asarray(loaded.vertices) * scale, faces=np.asarray(loaded.faces)).require_closed()
 
 
-def read_mesh(path: str | Path, *, scale: float = 1.0) -> Mesh:
+def read_mesh(path: str | Path, *, scale: float = 1.0) -> TriangleMesh:
     """A closed triangle mesh from an STL, PLY or OBJ file; scale: mm per unit of the file."""
     if not Path(path).is_file():
         raise FileError(f"{path} does not exist", path=path)
     return _load(str(path), scale)
 
 
-def write_stl(path: str | Path, mesh: Mesh) -> None:
+def write_stl(path: str | Path, mesh: TriangleMesh) -> None:
     """Binary STL, atomically."""
     from tomopose.files import atomic_file
 

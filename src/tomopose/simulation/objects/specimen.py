@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.simulation.objects.mesh import Mesh
+from tomopose.simulation.objects.mesh import TriangleMesh
 from tomopose.simulation.objects.tessellate import manifold
 from tomopose.units import Array
 
@@ -62,7 +62,7 @@ def measurands() -> tuple[Measurand, ...]:
 
 
 @functools.lru_cache(maxsize=2)
-def _nominal(edge: float, segments: int) -> Mesh:
+def _nominal(edge: float, segments: int) -> TriangleMesh:
     M = manifold().Manifold
 
     def rod(radius: float, z_0: float, z_1: float, n: int = segments, top: float | None = None) -> Any:
@@ -98,10 +98,10 @@ def _nominal(edge: float, segments: int) -> Mesh:
         thread += rod(THREAD_RADIUS + groove, middle, at + THREAD_PITCH, segments // 2, THREAD_RADIUS - 0.01)
     body -= thread.translate([0.0, 8.0, 0.0])
     mesh = body.refine_to_length(edge).to_mesh64()
-    return Mesh(vertices=np.asarray(mesh.vert_properties)[:, :3], faces=np.asarray(mesh.tri_verts))
+    return TriangleMesh(vertices=np.asarray(mesh.vert_properties)[:, :3], faces=np.asarray(mesh.tri_verts))
 
 
-def specimen_mesh(*, deviations: bool = False, edge: float = 0.5, segments: int = 180, seed: int = 0) -> Mesh:
+def specimen_mesh(*, deviations: bool = False, edge: float = 0.5, segments: int = 180, seed: int = 0) -> TriangleMesh:
     """The specimen, axis along z, origin at its middle.
 
     deviations: as made instead of nominal, drawn by `seed`.  edge: largest side of a triangle, mm.  segments: of a
@@ -111,7 +111,7 @@ def specimen_mesh(*, deviations: bool = False, edge: float = 0.5, segments: int 
     return as_made(nominal, seed=seed) if deviations else nominal
 
 
-def as_made(nominal: Mesh, *, seed: int = 0, sigma: float = DEVIATION) -> Mesh:
+def as_made(nominal: TriangleMesh, *, seed: int = 0, sigma: float = DEVIATION) -> TriangleMesh:
     """The mesh with smooth form deviations (sigma, mm) along its normals; vertices on edges stay.
 
     The form is a sum of 12 plane waves of 8 to 40 mm wavelength, so that neighbours move together.
@@ -137,4 +137,4 @@ def as_made(nominal: Mesh, *, seed: int = 0, sigma: float = DEVIATION) -> Mesh:
         np.sin(v @ (direction * wave[:, None]).T + rng.uniform(0, 2 * np.pi, n)).sum(axis=1) * sigma * math.sqrt(2 / n)
     )
     form[agree < math.cos(math.radians(SHARP_DEG))] = 0.0
-    return Mesh(vertices=v + form[:, None] * vertex_normal, faces=f)
+    return TriangleMesh(vertices=v + form[:, None] * vertex_normal, faces=f)

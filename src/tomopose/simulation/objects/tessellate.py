@@ -8,7 +8,7 @@ import numpy as np
 
 from tomopose.errors import EngineMissingError
 from tomopose.geometry.frames import Frame
-from tomopose.simulation.objects.mesh import INSTALL, Mesh
+from tomopose.simulation.objects.mesh import INSTALL, TriangleMesh
 from tomopose.simulation.objects.shapes import (
     BOX,
     CONE,
@@ -68,7 +68,7 @@ def to_manifold(shape: Shape, segments: int) -> Any:
     return a ^ b if shape.op == INTERSECTION else a + b
 
 
-def tessellate(solids: tuple[Solid, ...], *, segments: int = 256) -> list[tuple[Mesh, str, Frame]]:
+def tessellate(solids: tuple[Solid, ...], *, segments: int = 256) -> list[tuple[TriangleMesh, str, Frame]]:
     """(mesh, material, frame) of each solid, less what later solids of its frame displace."""
     bodies = [to_manifold(s.shape, segments) for s in solids]
     out = []
@@ -81,7 +81,7 @@ def tessellate(solids: tuple[Solid, ...], *, segments: int = 256) -> list[tuple[
         if len(mesh.tri_verts):
             out.append(
                 (
-                    Mesh(vertices=np.asarray(mesh.vert_properties)[:, :3], faces=np.asarray(mesh.tri_verts)),
+                    TriangleMesh(vertices=np.asarray(mesh.vert_properties)[:, :3], faces=np.asarray(mesh.tri_verts)),
                     solid.material,
                     solid.frame,
                 )

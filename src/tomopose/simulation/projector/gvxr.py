@@ -14,7 +14,7 @@ import numpy as np
 from tomopose.errors import EngineFailedError, EngineMissingError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.simulation.objects.mesh import Mesh
+from tomopose.simulation.objects.mesh import TriangleMesh
 from tomopose.simulation.physics.spectrum import Beam
 from tomopose.simulation.projector.view import View, Window
 from tomopose.units import Array
@@ -87,7 +87,7 @@ def path_images(
 def add_gvxr_transmission(
     out: Any,
     window: Window,
-    bodies: list[tuple[Mesh, str, Frame]],
+    bodies: list[tuple[TriangleMesh, str, Frame]],
     materials: tuple[str, ...],
     beam: Beam,
     view: View,

@@ -18,7 +18,7 @@ from numba import njit
 from tomopose.errors import OutOfViewError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.simulation.objects.mesh import Mesh, MeshSolid
+from tomopose.simulation.objects.mesh import MeshSolid, TriangleMesh
 from tomopose.simulation.projector.view import View, Window, in_bands
 from tomopose.units import Array
 
@@ -48,7 +48,9 @@ class Projected:
         return self.x, self.y, self.h, self.faces, self.column, self.mark, self.sign
 
 
-def projected(meshes: list[tuple[Mesh, RigidTransform, int]], view: View, origin: tuple[float, float]) -> Projected:
+def projected(
+    meshes: list[tuple[TriangleMesh, RigidTransform, int]], view: View, origin: tuple[float, float]
+) -> Projected:
     """Meshes (mesh, transform to W, material's column) on the panel; origin: the grid's (0, 0) in pixels (u, v)."""
     axes = np.column_stack([view.U, view.V, view.O - view.source])
     corners, faces, column, mark, n = [], [], [], [], 0

@@ -23,7 +23,7 @@ from tomopose.geometry.scanner import R_WS, Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.simulation.detector.detector import Detector
-from tomopose.simulation.objects.mesh import Mesh, MeshSolid, read_mesh
+from tomopose.simulation.objects.mesh import MeshSolid, TriangleMesh, read_mesh
 from tomopose.simulation.physics.materials import MATERIALS, Material, from_formula
 from tomopose.simulation.physics.spectrum import Spectrum, tube_spectrum
 from tomopose.simulation.projector.focal_spot import FWHM_PER_SIGMA, FocalSpot
@@ -220,7 +220,7 @@ def _detector(content: Mapping[str, Any], scanner: Scanner) -> Detector:
     )
 
 
-def run_to_ctsimu(run: SimulatedRun) -> tuple[dict[str, Any], dict[str, Mesh]]:
+def run_to_ctsimu(run: SimulatedRun) -> tuple[dict[str, Any], dict[str, TriangleMesh]]:
     """(scenario content, mesh files by name): geometry by the true poses, meshes in M, tessellated where analytic.
 
     Tube, filters and scintillator are named where the run knows them; a spectrum from a table has its highest energy
@@ -239,7 +239,7 @@ def run_to_ctsimu(run: SimulatedRun) -> tuple[dict[str, Any], dict[str, Mesh]]:
     content = to_ctsimu(matrices)
     # The scan's volume is fixed to W at home; the bodies are fixed to M.
     T_MW = run.scanner.T_TW(0.0) @ run.T_HT @ RigidTransform.identity(Frame.M, Frame.H)
-    files: dict[str, Mesh] = {}
+    files: dict[str, TriangleMesh] = {}
     samples = []
     for k, (mesh, material, frame) in enumerate(run.tessellated):
         if frame is not Frame.M:

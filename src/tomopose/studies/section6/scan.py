@@ -17,7 +17,7 @@ from tomopose.geometry.rotations import R_y
 from tomopose.geometry.scanner import Scanner
 from tomopose.kept import Key, key_of
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.simulation.objects.mesh import Mesh, MeshSolid
+from tomopose.simulation.objects.mesh import MeshSolid, TriangleMesh
 from tomopose.simulation.objects.specimen import specimen_mesh
 from tomopose.simulation.objects.sphere_standard import BASE_TOP, SHAFT_DIAMETER, sphere_centres, sphere_diameters
 from tomopose.simulation.physics.materials import attenuation
@@ -80,7 +80,7 @@ class Scan:
     seed: int
 
 
-def specimen(edge: float) -> Mesh:
+def specimen(edge: float) -> TriangleMesh:
     """The specimen as made, part coordinates."""
     return specimen_mesh(deviations=True, edge=edge)
 
@@ -148,7 +148,9 @@ def path_maker(scan: Scan) -> Callable[[int], Array]:
     if scan.thing == "specimen":
         mesh = specimen(scan.edge)
         solid = MeshSolid(
-            mesh=Mesh(vertices=mesh.vertices @ MOUNTED.T, faces=mesh.faces), material="EN AW-6082", frame=Frame.W
+            mesh=TriangleMesh(vertices=mesh.vertices @ MOUNTED.T, faces=mesh.faces),
+            material="EN AW-6082",
+            frame=Frame.W,
         )
         return lambda j: mesh_paths(P[j], solid, n_u, n_v)
     centres = sphere_centres()
