@@ -49,7 +49,7 @@ def test_what_cannot_be_told_is_said(study, tmp_path):
     code, said, code_c, _ = ran(study, tmp_path, "order ZYX", still=True)
     assert code == code_c == 0
     assert next(h["outcome"] for h in said["hypotheses"] if h["name"] == "order ZYX") == "same"
-    told = next(line for line in said["advice"] if line.startswith("cannot be told apart"))
+    told = next(line for line in said["advice"] if line.startswith("cannot be distinguished"))
     assert "order ZYX" in told
 
 

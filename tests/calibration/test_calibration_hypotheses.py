@@ -106,7 +106,7 @@ def test_the_papers_plan_is_blind_to_what_it_is_blind_to():
     found = diagnose(SCANNER, poses, observe(poses))
     same = {h.name for h in found.same}
     assert {"order ZYX", "order YXZ", "half a pixel low", "half a pixel high", "table zero"} <= same
-    assert "cannot be told apart" in " ".join(found.advice)
+    assert "cannot be distinguished" in " ".join(found.advice)
     by_name = {h.name: h for h in found.hypotheses}
     assert by_name["sign of UVW"].d_rms > 1.0
     assert by_name["sign of UVW"].outcome == "worse"

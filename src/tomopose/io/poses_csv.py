@@ -125,6 +125,8 @@ def poses_from_table(
         convention=convention.name,
         source=source,
         q=q,
+        orientations=_orientations(table, convention),
+        units_confirmed=confirmed,
     )
 
 
@@ -237,6 +239,15 @@ def _pose(table: TextTable, convention: Convention, *, commanded: bool, confirme
     except InputError as error:
         raise InputError(f"{table.path}: {error}") from error
     return RigidTransform(R=R, t=positions, source=Frame.M, target=Frame.H)
+
+
+def _orientations(table: TextTable, convention: Convention) -> Array | None:
+    """(n, 3 or 4) the orientation columns of the poses that are used, as written; None where there are none."""
+    for commanded in (False, True):
+        columns = pose_columns(convention, commanded=commanded)[len(POSITION) :]
+        if all(c in table.columns for c in columns):
+            return np.column_stack([table.numbers(c) for c in columns])
+    return None
 
 
 def _pose_id(table: TextTable) -> tuple[str, ...]:

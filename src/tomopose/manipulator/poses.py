@@ -32,6 +32,9 @@ class PoseSequence:
     pivot:     (3,) mm, the controller's pivot point, or None where it is not known.
     convention, source: how the table was written, and whether T_MH is the encoder's or the set pose.
     q:         (n, m) joint values (rad or mm) of a serial robot, or None.
+    orientations: (n, 3 or 4) the orientation columns as they were written, in the convention's unit, or None.  They
+               serve to test other readings of them; T_MH holds the poses.
+    units_confirmed: the user says that unusual magnitudes are right (`# units: confirmed`).
     """
 
     T_MH: RigidTransform
@@ -45,6 +48,8 @@ class PoseSequence:
     convention: str = "pi-hexapod"
     source: Literal["encoder", "set"] = "encoder"
     q: Array | None = None
+    orientations: Array | None = None
+    units_confirmed: bool = False
 
     def __post_init__(self) -> None:
         self.T_MH.require(Frame.M, Frame.H)
@@ -81,6 +86,11 @@ class PoseSequence:
             if q.ndim != 2 or len(q) != n:
                 raise ShapeError(f"q has shape {q.shape}; a row of joint values for each of {n} poses is needed")
             object.__setattr__(self, "q", q)
+        if self.orientations is not None:
+            written = float_array(self.orientations)
+            if written.ndim != 2 or len(written) != n:
+                raise ShapeError(f"orientations has shape {written.shape}; one row for each of {n} poses is needed")
+            object.__setattr__(self, "orientations", written)
 
     def __len__(self) -> int:
         return len(self.pose_id)
@@ -104,7 +114,13 @@ class PoseSequence:
             target=Frame.H,
         )
         ids = range(len(positions)) if pose_id is None else pose_id
-        return cls(T_MH=T_MH, pose_id=tuple(str(i) for i in ids), convention=convention, **columns)
+        return cls(
+            T_MH=T_MH,
+            pose_id=tuple(str(i) for i in ids),
+            convention=convention,
+            orientations=np.asarray(orientations, dtype=np.float64),
+            **columns,
+        )
 
     def select(self, index: Any) -> PoseSequence:
         """The poses with those indices (or that mask or slice), in that order."""
@@ -123,6 +139,7 @@ class PoseSequence:
             time_utc=of(self.time_utc),
             T_MH_set=None if self.T_MH_set is None else self.T_MH_set[i],
             q=None if self.q is None else self.q[i],
+            orientations=None if self.orientations is None else self.orientations[i],
         )
 
     def index_of(self, pose_id: Sequence[str]) -> np.ndarray:
@@ -140,7 +157,7 @@ class PoseSequence:
         """The same sequence with the commanded poses in place of the encoder's."""
         if self.T_MH_set is None:
             raise InputError("the pose table holds no set poses (columns x_set_mm ...)")
-        return replace(self, T_MH=self.T_MH_set, T_MH_set=None, source="set")
+        return replace(self, T_MH=self.T_MH_set, T_MH_set=None, source="set", orientations=None)
 
     def rotation_vectors(self) -> Array:
         """(n, 3), rad: the logarithm of each pose's rotation."""

@@ -1,80 +1,118 @@
-"""Could the data have been written in another convention?  Every rival is fitted and ranked; none is ever applied.
+"""Could the data have been written in another convention?  Every alternative is fitted and ranked; none is ever applied.
 
-The measure is delta = (chi2_rival - chi2_declared) / max(1, min of both / dof), both for the same number of equations.
-A rival that fits better and still leaves a drift or a step in time is compared again with both free to follow it.
+The measure is delta = (chi2_alternative - chi2_declared) / max(1, min of both / dof), both for the same number of
+equations.  An alternative that fits better and still leaves a drift or a step in time is compared again with both free
+to follow it.
+
+A comparison alone advises nothing: of forty wrong readings one always fits best.  An alternative is advised only where
+its own residual is at most `FITS_SIGMAS` stated standard uncertainties and it places every ball between focal spot and
+panel.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.checks.conventions import RIVALS, Rival
-from tomopose.calibration.checks.stability import SIGNIFICANT, chi2_with_movements, movements
+from tomopose.calibration.checks.alternative import Alternative
+from tomopose.calibration.checks.conventions import ALTERNATIVES, ALTERNATIVES_OF_MOVING_SCANNER
+from tomopose.calibration.checks.placement import Placement, better_placed, placement
+from tomopose.calibration.checks.stability import SIGNIFICANT, Effect, chi2_with_movements, movements
 from tomopose.calibration.model.parameters import UNITS, FreeParameters, free_parameters
 from tomopose.calibration.model.problem import Problem, pair
 from tomopose.calibration.rigid.estimate import best_fit
-from tomopose.calibration.rigid.fit import Fit, minimise, residuals
+from tomopose.calibration.rigid.fit import Fit, minimise, residuals, whitened2
 from tomopose.calibration.rigid.start import Rays, closed_form, other_starts, ray_equations, turned_about_beam
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.inverse import inverse_poses
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.units import Array
 
 SAME, BETTER = 9.0, 25.0
-"""delta below SAME (3 sigma): cannot be told apart.  delta below -BETTER (5 sigma): the rival fits better."""
+"""delta below SAME (3 sigma): cannot be distinguished.  delta below -BETTER (5 sigma): the alternative fits better."""
 
 GOOD_CHI2, CLEARLY = 4.0, 1.5
-"""Where the rival, too, leaves chi2/dof above GOOD_CHI2, poses or sigmas are wrong in ways of their own, and delta has
-no such meaning: the rival must lower chi2 by the factor CLEARLY to count as better."""
+"""Where the alternative, too, leaves chi2/dof above GOOD_CHI2, poses or sigmas are wrong in ways of their own, and delta
+has no such meaning: the alternative must lower chi2 by the factor CLEARLY to count as better."""
 
-RIVAL_ITERATIONS = 20
-"""A rival that is right needs fewer; one that is wrong is not worth more."""
+FITS_SIGMAS = 10.0
+"""A reading whose centres lie more than this many stated standard uncertainties away explains nothing.  Wrong readings
+of robot poses leave thousands; a manipulator in need of identification leaves up to a hundred, and then no convention
+can be advised before its errors are known."""
+
+BELONGING = 0.8
+"""Share of the centres by which a reading is judged: up to 20 % may be outliers (`rigid.outliers.LARGEST_SHARE`)."""
+
+BELONGING_MEAN = 2.0 * (1.0 - (1.0 - BELONGING) * np.log(1.0 / (1.0 - BELONGING)) / BELONGING)
+"""Mean of the smallest BELONGING of chi2 values with 2 degrees of freedom (exponential, mean 2): 1.195."""
+
+MEANINGLESS_SHARE = 0.02
+"""Residuals above this share of the centres' spread: the poses explain the images hardly better than chance.  The rigid
+model of an uncalibrated hexapod leaves 0.006 (1.5 px of 250 px), wrong conventions leave 0.1 to 0.7."""
+
+ITERATIONS = 20
+"""An alternative that is right needs fewer; one that is wrong is not worth more."""
 
 MUCH_BETTER = 2.0
-"""A rival that fits better and lowers chi2 (floored at dof) by this factor makes a calibration untrustworthy."""
+"""An alternative that fits better and lowers chi2 (floored at dof) by this factor makes a calibration untrustworthy."""
 
 WORDS = {
     "declared": "as declared",
     "better": "fits significantly better than what was declared",
-    "same": "cannot be told apart with these poses",
+    "same": "cannot be distinguished with these poses",
     "worse": "excluded",
+    "unfit": "does not fit either",
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hypothesis:
-    """A rival reading of the data, fitted.
+    """An alternative reading of the data, fitted.
 
-    d_rms: px, eq. (8);  chi2, dof: of its fit;  delta: see above, 0 for the declared reading;
-    factor: chi2 of the declared reading over the rival's, both floored at dof;
-    outcome: declared | better | same | worse;  symmetry: no plan could tell it apart.
+    d_rms: px, eq. (8);  chi2, dof: of its fit;  sigmas: rms residual in stated standard uncertainties, of the 80 % that
+    fit best;  delta: see above, 0 for the declared reading;  factor: chi2 of the declared reading over the
+    alternative's, both floored at dof;  outcome: declared | better | same | worse | unfit;  symmetry: no plan could
+    distinguish it;  length_factor: of `Alternative`;  ball_mm: distance of the ball from the focal spot, median.
     """
 
     name: str
     words: str
-    cure: str
+    remedy: str
     d_rms: float
     chi2: float
     dof: int
+    sigmas: float
     delta: float
     factor: float
     outcome: str
     symmetry: bool = False
+    length_factor: float = 1.0
+    ball_mm: float = float("nan")
+
+    @property
+    def cure(self) -> str:
+        return self.remedy
+
+    @property
+    def fits(self) -> bool:
+        """Whether the residual is at most `FITS_SIGMAS`."""
+        return self.sigmas <= FITS_SIGMAS
 
     def to_json(self) -> dict[str, Any]:
         return {
             "name": self.name,
             "words": self.words,
-            "cure": self.cure,
+            "cure": self.remedy,
             "d_rms_px": self.d_rms,
             "chi2": self.chi2,
             "dof": self.dof,
+            "sigmas": self.sigmas,
             "delta_chi2": self.delta,
             "factor": self.factor,
             "outcome": self.outcome,
@@ -87,13 +125,21 @@ class Hypothesis:
 class Diagnosis:
     """Hypotheses ranked by fit, best first; the declared reading is among them.
 
-    better: rivals that fit significantly better;  same: rivals that these poses cannot tell from the declared reading.
+    spread: px, rms distance of the centres from their mean;  placed: where the declared reading puts the balls.
+    better: alternatives that fit significantly better;  same: those that these poses cannot distinguish from the
+    declared reading.
     """
 
     hypotheses: tuple[Hypothesis, ...]
+    spread: float = float("inf")
+    placed: Placement | None = None
 
     def named(self, outcome: str) -> tuple[Hypothesis, ...]:
         return tuple(h for h in self.hypotheses if h.outcome == outcome)
+
+    @property
+    def declared(self) -> Hypothesis:
+        return self.named("declared")[0]
 
     @property
     def better(self) -> tuple[Hypothesis, ...]:
@@ -104,8 +150,23 @@ class Diagnosis:
         return self.named("same")
 
     @property
+    def other_units(self) -> tuple[Hypothesis, ...]:
+        """Units of the positions that fit as well as millimetres and place the ball where a scanner has it."""
+        return tuple(h for h in self.same if h.length_factor != 1.0)
+
+    @property
+    def nothing_fits(self) -> bool:
+        """Whether every reading, the declared one included, leaves more than `FITS_SIGMAS`."""
+        return not any(h.fits for h in self.hypotheses)
+
+    @property
+    def meaningless(self) -> bool:
+        """Whether nothing fits and the declared reading explains the images hardly better than chance."""
+        return self.nothing_fits and self.declared.d_rms > MEANINGLESS_SHARE * self.spread
+
+    @property
     def leading(self) -> tuple[Hypothesis, ...]:
-        """The rival that fits best of those that fit better, and those that these poses cannot tell from it."""
+        """The alternative that fits best of those that fit better, and those that cannot be distinguished from it."""
         if not self.better:
             return ()
         unit = {h.name: h.chi2 * self.better[0].dof / max(h.dof, 1) for h in self.better}
@@ -114,18 +175,43 @@ class Diagnosis:
         return tuple(h for h in self.better if unit[h.name] - least < SAME * noise)
 
     @property
+    def nothing_fits_words(self) -> str:
+        """Says how far the best reading is from fitting."""
+        best = min(self.hypotheses, key=lambda h: h.sigmas)
+        return (
+            f"nothing fits: the best of {len(self.hypotheses)} readings ({best.words}) still leaves {best.d_rms:.3g} px, "
+            f"{best.sigmas:.3g} stated standard uncertainties, where {FITS_SIGMAS:g} are the limit; no convention is "
+            "advised. Check that images and poses belong together, the values in scanner.json, the centres' sigmas and "
+            "whether the manipulator reaches the poses it reports"
+        )
+
+    @property
     def advice(self) -> tuple[str, ...]:
-        """Sentences: what to change, what cannot be told.  Nothing is changed by itself."""
-        lines = [f"{h.words}: fits better (delta chi2 {h.delta:.3g}); to try: {h.cure}" for h in self.leading]
+        """Sentences: what to change, what cannot be distinguished.  Nothing is changed by itself."""
+        lines = [f"{h.words}: fits better (delta chi2 {h.delta:.3g}); to try: {h.remedy}" for h in self.leading]
         if len(lines) > 1:
-            lines.append("these readings fit equally well; these poses cannot tell them apart from one another")
-        told = [] if lines else [h.name for h in self.same if not h.symmetry]
-        if told:
-            lines.append(f"cannot be told apart with these poses: {', '.join(told)}")
+            lines.append("these readings fit equally well; these poses cannot distinguish them from one another")
+        if self.nothing_fits:
+            lines.append(self.nothing_fits_words)
+        if not lines:
+            lines += [other_unit_words(h, self.declared) for h in self.other_units]
+            alike = [h.name for h in self.same if not h.symmetry and h.length_factor == 1.0]
+            if alike:
+                lines.append(f"cannot be distinguished with these poses: {', '.join(alike)}")
         kept = [h.name for h in self.same if h.symmetry]
         if kept:
-            lines.append(f"true symmetries, which no poses can tell apart: {', '.join(kept)}")
+            lines.append(f"true symmetries, which no poses can distinguish: {', '.join(kept)}")
         return tuple(lines)
+
+
+def other_unit_words(h: Hypothesis, declared: Hypothesis) -> str:
+    """Why another unit of the positions is the likelier one, and what would settle it."""
+    return (
+        f"{h.words}: fits as well, and places the ball {h.ball_mm:.4g} mm from the focal spot, near the rotation axis, "
+        f"where millimetres place it at {declared.ball_mm:.4g} mm; to try: {h.remedy}. The ball's diameter with the "
+        "outlines' semi axes, or another table angle, settles it; '# units: confirmed' in poses.csv says that they are "
+        "millimetres"
+    )
 
 
 def _rms(problem: Problem, fit: Fit, free: FreeParameters) -> float:
@@ -133,75 +219,99 @@ def _rms(problem: Problem, fit: Fit, free: FreeParameters) -> float:
     return float(np.sqrt((r**2).sum(axis=1).mean()))
 
 
-def _fit_rival(problem: Problem, rays: Rays, free: FreeParameters, held: FreeParameters, starts: int) -> Fit:
+def residual_sigmas(problem: Problem, free: FreeParameters, fit: Fit) -> float:
+    """rms residual of a coordinate in stated standard uncertainties, of the 80 % of the centres that fit best."""
+    d2 = np.sort(whitened2(problem, residuals(problem, free, fit)))
+    kept = d2[: max(1, int(np.ceil(BELONGING * len(d2))))]
+    return float(np.sqrt(kept.mean() / BELONGING_MEAN))
+
+
+def _fit_alternative(problem: Problem, rays: Rays, free: FreeParameters, held: FreeParameters, starts: int) -> Fit:
     start = closed_form(problem, rays)
-    fit = minimise(problem, held, start, iterations=RIVAL_ITERATIONS)
+    fit = minimise(problem, held, start, iterations=ITERATIONS)
     if not np.isfinite(fit.chi2):
-        fit = minimise(problem, held, turned_about_beam(problem, start[0], rays), iterations=RIVAL_ITERATIONS)
+        fit = minimise(problem, held, turned_about_beam(problem, start[0], rays), iterations=ITERATIONS)
     if not np.isfinite(fit.chi2):
         # mirrored data have no closed form in front of the source; the residual they leave is still worth knowing
         others = (
-            minimise(problem, held, start, iterations=RIVAL_ITERATIONS)
+            minimise(problem, held, start, iterations=ITERATIONS)
             for start in itertools.islice(other_starts(problem, rays), starts)
         )
         fit = minimise(problem, held, min((fit, *others), key=lambda one: one.chi2))
-    return minimise(problem, free, fit, iterations=RIVAL_ITERATIONS) if len(free) else fit
+    return minimise(problem, free, fit, iterations=ITERATIONS) if len(free) else fit
 
 
-def ranked(
-    problem: Problem, free: FreeParameters, fit: Fit, rivals: Iterable[Rival] = RIVALS, *, starts: int = 24
-) -> Diagnosis:
-    """The declared reading, fitted by `fit`, against rivals.
+@dataclass(frozen=True, kw_only=True)
+class _Declared:
+    """The declared reading that alternatives are judged against."""
 
-    starts: how many rotations are tried for a rival whose closed form leads nowhere.  Such a rival is not the truth (of
-    that the closed form finds the optimum); with 0 it is left out.
-    """
-    held = free_parameters(problem.scanners, fix=tuple(UNITS))
-    rays = ray_equations(problem)
-    m = fit.N.shape[0]
-    n_prior = int((free.information > 0).sum())
-    dof = 2 * len(problem) + n_prior - m
-    found = [
-        Hypothesis(
+    problem: Problem
+    free: FreeParameters
+    fit: Fit
+    placed: Placement
+
+    @property
+    def n_prior(self) -> int:
+        return int((self.free.information > 0).sum())
+
+    def dof(self, problem: Problem) -> int:
+        return 2 * len(problem) + self.n_prior - self.fit.N.shape[0]
+
+    def sigmas(self) -> float:
+        """What the declared reading leaves, beside what moved where that is much."""
+        found = residual_sigmas(self.problem, self.free, self.fit)
+        moved = _moved(self.problem, self.free, self.fit) if found > FITS_SIGMAS else []
+        if not moved:
+            return found
+        chi2 = chi2_with_movements(self.problem, self.free, self.fit, moved)
+        return min(found, float(np.sqrt(chi2 / self.dof(self.problem))))
+
+    def hypothesis(self) -> Hypothesis:
+        return Hypothesis(
             name="declared",
             words="the data as declared",
-            cure="",
-            d_rms=_rms(problem, fit, free),
-            chi2=fit.chi2,
-            dof=dof,
+            remedy="",
+            d_rms=_rms(self.problem, self.fit, self.free),
+            chi2=self.fit.chi2,
+            dof=self.dof(self.problem),
+            sigmas=self.sigmas(),
             delta=0.0,
             factor=1.0,
             outcome="declared",
+            ball_mm=self.placed.median,
         )
-    ]
-    for rival in rivals:
-        changed = rival.change(problem)
-        if changed is None:
-            continue
-        dof_r = 2 * len(changed) + n_prior - m
-        if dof_r <= 0:
+
+
+def ranked(
+    problem: Problem,
+    free: FreeParameters,
+    fit: Fit,
+    alternatives: Iterable[Alternative] = ALTERNATIVES,
+    *,
+    starts: int = 24,
+) -> Diagnosis:
+    """The declared reading, fitted by `fit`, against alternatives.
+
+    starts: how many rotations are tried for an alternative whose closed form leads nowhere.  Such a one is not the
+    truth (of that the closed form finds the optimum); with 0 it is left out.
+    """
+    held = free_parameters(problem.scanners, fix=tuple(UNITS))
+    rays = ray_equations(problem)
+    declared = _Declared(problem=problem, free=free, fit=fit, placed=placement(problem, fit))
+    found = [declared.hypothesis()]
+    for alternative in alternatives:
+        changed = alternative.change(problem)
+        if changed is None or declared.dof(changed) <= 0:
             continue
         same_rays = changed.x_D is problem.x_D and changed.alpha is problem.alpha
-        other = _fit_rival(changed, rays if same_rays else ray_equations(changed), free, held, starts)
+        other = _fit_alternative(changed, rays if same_rays else ray_equations(changed), free, held, starts)
         if not np.isfinite(other.chi2):
             continue
-        judged = _judged(rival, changed, other, free, fit.chi2, dof, dof_r)
-        if judged.outcome == "better":
-            moved = [e for e in movements(changed, free, other) if e.p < SIGNIFICANT]
-            if moved:
-                # under the rival, too, something moved: let both follow it, or a drift would pass for a convention
-                still = _judged(
-                    rival,
-                    changed,
-                    replace(other, chi2=chi2_with_movements(changed, free, other, moved)),
-                    free,
-                    chi2_with_movements(problem, free, fit, moved),
-                    dof,
-                    dof_r,
-                )
-                judged = judged if still.outcome == "better" else replace(still, chi2=other.chi2)
-        found.append(judged)
-    return Diagnosis(hypotheses=tuple(sorted(found, key=_rank)))
+        judged = _judged_beside_movements(declared, alternative, changed, other)
+        if judged is not None:
+            found.append(judged)
+    spread = float(np.sqrt(((problem.x_D - problem.x_D.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    return Diagnosis(hypotheses=tuple(sorted(found, key=_rank)), spread=spread, placed=declared.placed)
 
 
 def _rank(h: Hypothesis) -> tuple[int, float]:
@@ -209,65 +319,114 @@ def _rank(h: Hypothesis) -> tuple[int, float]:
     return {"better": 0, "declared": 1}.get(h.outcome, 2), h.delta
 
 
+def _judged_beside_movements(
+    declared: _Declared, alternative: Alternative, changed: Problem, other: Fit
+) -> Hypothesis | None:
+    """The judgement; where the alternative fits better and something still moved under it, with both free to move."""
+    free = declared.free
+    judged = _judged(declared, alternative, changed, other, declared.fit.chi2)
+    if judged is None or judged.delta > -BETTER:
+        return judged
+    moved = _moved(changed, free, other)
+    if not moved:
+        return judged
+    following = replace(other, chi2=chi2_with_movements(changed, free, other, moved))
+    chi2 = chi2_with_movements(declared.problem, free, declared.fit, moved)
+    still = _judged(declared, alternative, changed, following, chi2)
+    if still is not None and still.outcome == "better":
+        return replace(judged, outcome="better", sigmas=still.sigmas)
+    return judged if still is None or judged.outcome != "better" else replace(still, chi2=other.chi2)
+
+
+def _moved(problem: Problem, free: FreeParameters, fit: Fit) -> list[Effect]:
+    return [e for e in movements(problem, free, fit) if e.p < SIGNIFICANT]
+
+
 def _judged(
-    rival: Rival, changed: Problem, other: Fit, free: FreeParameters, chi2: float, dof: int, dof_r: int
-) -> Hypothesis:
-    chi2_r = other.chi2 * dof / dof_r
-    delta = (chi2_r - chi2) / max(1.0, min(chi2, chi2_r) / dof)
-    factor = max(chi2, dof) / max(chi2_r, dof)
-    believable = chi2_r < GOOD_CHI2 * dof or factor > CLEARLY
-    outcome = "better" if delta < -BETTER and believable else "same" if delta < SAME else "worse"
+    declared: _Declared, alternative: Alternative, changed: Problem, other: Fit, chi2: float
+) -> Hypothesis | None:
+    """The comparison of one alternative; None where it puts a ball where none can be, or only renames the unit."""
+    free = declared.free
+    placed = placement(changed, other)
+    dof, dof_a = declared.dof(declared.problem), declared.dof(changed)
+    chi2_a = other.chi2 * dof / dof_a
+    delta = (chi2_a - chi2) / max(1.0, min(chi2, chi2_a) / dof)
+    factor = max(chi2, dof) / max(chi2_a, dof)
+    # a chi2 that follows a movement says what the reading leaves beside it
+    sigmas = min(residual_sigmas(changed, free, other), float(np.sqrt(other.chi2 / dof_a)))
+    believable = chi2_a < GOOD_CHI2 * dof or factor > CLEARLY
+    better = delta < -BETTER and believable
+    if alternative.length_factor != 1.0 and not (better and placed.possible):
+        # centres alone cannot show the unit while the table stands still; where the ball stands can
+        if changed.units_confirmed or not placed.possible or not better_placed(placed, declared.placed):
+            return None
+    outcome = "better" if better else "same" if delta < SAME else "worse"
+    if outcome != "worse" and not (sigmas <= FITS_SIGMAS and placed.possible):
+        outcome = "unfit"
     return Hypothesis(
-        name=rival.name,
-        words=rival.words,
-        cure=rival.cure,
+        name=alternative.name,
+        words=alternative.words,
+        remedy=alternative.remedy,
         d_rms=_rms(changed, other, free),
         chi2=other.chi2,
-        dof=dof_r,
+        dof=dof_a,
+        sigmas=sigmas,
         delta=float(delta),
         factor=float(factor),
         outcome=outcome,
-        symmetry=rival.symmetry,
+        symmetry=alternative.symmetry,
+        length_factor=alternative.length_factor,
+        ball_mm=placed.median,
     )
 
 
-def set_pose_rival(problem: Problem, poses: PoseSequence | Iterable[PoseSequence]) -> Rival | None:
-    """The rival "the other of set and encoder poses", where the table holds both."""
+def set_pose_alternative(problem: Problem, poses: PoseSequence | Iterable[PoseSequence]) -> Alternative | None:
+    """The alternative "the other of set and encoder poses", where the table holds both."""
     runs = [poses] if isinstance(poses, PoseSequence) else list(poses)
-    if any(p.T_MH_set is None for p in runs):
-        return None
     commanded: list[RigidTransform] = [p.T_MH_set for p in runs if p.T_MH_set is not None]
+    if len(commanded) < len(runs):
+        return None
 
     def change(p: Problem) -> Problem:
         R: Array = np.array([commanded[r].R[i] for r, i in zip(p.run, p.index, strict=True)])
         t: Array = np.array([commanded[r].t[i] for r, i in zip(p.run, p.index, strict=True)])
         return replace(p, R_MH=R, t_MH=t)
 
-    return Rival(
+    return Alternative(
         name="set poses",
         words="the images were taken at the set poses, not at the encoder's",
-        cure="poses.csv: # source: set",
+        remedy="poses.csv: # source: set",
         change=change,
         quick=True,
     )
 
 
 def diagnose(
-    scanner: Scanner | Iterable[Scanner],
-    poses: PoseSequence | Iterable[PoseSequence],
-    observations: BallObservations | Iterable[BallObservations],
+    scanner: Scanner | Sequence[Scanner],
+    poses: PoseSequence | Sequence[PoseSequence],
+    observations: BallObservations | Sequence[BallObservations],
+    *,
+    free: Sequence[str] = (),
+    fix: Sequence[str] = (),
+    priors: Mapping[str, float] | None = None,
+    moving_scanner: bool = False,
 ) -> Diagnosis:
-    """Rank some 40 rival conventions against the declared one.  It never changes an input.
+    """Rank some 65 alternative conventions against the declared one.  It never changes an input.
+
+    scanner, poses, observations, free, fix, priors: as in `calibrate`, several runs included.
+    moving_scanner: source and detector move and the ball stands still, as in `calibrate_inverse`.
 
     Raises InputError where observations and poses do not pair.
     """
-    given = (
-        value if isinstance(value, (Scanner, PoseSequence, BallObservations)) else list(value)
-        for value in (scanner, poses, observations)
-    )
-    scanner_, poses_, observations_ = given
-    problem = pair(scanner_, poses_, observations_)  # type: ignore[arg-type]
-    free = free_parameters(problem.scanners)
-    fit = best_fit(problem, free)
-    extra = set_pose_rival(problem, poses_)  # type: ignore[arg-type]
-    return ranked(problem, free, fit, [*RIVALS, *([extra] if extra else [])])
+    runs = [poses] if isinstance(poses, PoseSequence) else list(poses)
+    if moving_scanner:
+        runs = [inverse_poses(p) for p in runs]
+    problem = pair(scanner, runs, observations if not isinstance(observations, BallObservations) else [observations])
+    freed = free_parameters(problem.scanners, free=free, fix=fix, priors=priors)
+    fit = best_fit(problem, freed)
+    other = set_pose_alternative(problem, runs)
+    known = ALTERNATIVES_OF_MOVING_SCANNER if moving_scanner else ALTERNATIVES
+    return ranked(problem, freed, fit, [*known, *([other] if other else [])])
+
+
+set_pose_rival = set_pose_alternative

@@ -1,81 +1,27 @@
-"""The list of rival readings of the same data: what each would change, and the line that would cure it.
+"""The alternative conventions of the same data: what each would change, and the line of the input that would change.
 
-A rival is a function from a `Problem` to the `Problem` that would be right if the data had been written in the rival's
-convention; None where it does not apply to these data.
+An alternative is a function from a `Problem` to the `Problem` that would be right if the data had been written in the
+other convention; None where it does not apply to these data.  The readings of the orientation columns stand in
+`orientation_readings`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from tomopose.calibration.model.problem import Problem
-from tomopose.geometry.rotations import CONVENTIONS
-from tomopose.units import Array
+from tomopose.calibration.checks.alternative import Alternative, Change
+from tomopose.calibration.checks.orientation_readings import POSES, orientation_alternatives
+from tomopose.calibration.model.problem import Problem, rotated
 
-EULER_ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 TABLE_OFFSET = np.radians(5.0)
+ROWS = "scanner.json: the other value of image_rows"
+FEWEST_PAIRS = 5
 
-
-@dataclass(frozen=True, kw_only=True)
-class Rival:
-    """name: short, fixed;  words: what would be so;  cure: what to change in the input;  change: see above;
-    quick: tried by every calibration;  symmetry: the data are the same by nature, in any plan."""
-
-    name: str
-    words: str
-    cure: str
-    change: Callable[[Problem], Problem | None]
-    quick: bool = False
-    symmetry: bool = False
-
-
-def _angles(p: Problem) -> tuple[Any, Array]:
-    """(scipy's axes, angles (n, 3) rad) in which the poses were written; R_x R_y R_z for conventions without angles."""
-    convention = CONVENTIONS.get(p.convention)
-    axes: Any = convention.axes if convention is not None and convention.axes else "XYZ"
-    if axes[0].upper() == axes[2].upper():
-        axes = "XYZ"
-    return axes, Rotation.from_matrix(p.R_MH).as_euler(axes, suppress_warnings=True)
-
-
-def _rotated(p: Problem, R: Array) -> Problem:
-    return replace(p, R_MH=np.ascontiguousarray(R))
-
-
-def _signs(signs: tuple[int, int, int]) -> Callable[[Problem], Problem | None]:
-    def change(p: Problem) -> Problem | None:
-        axes, angles = _angles(p)
-        by_axis = np.array([signs["XYZ".index(a)] for a in axes.upper()])
-        return _rotated(p, Rotation.from_euler(axes, by_axis * angles).as_matrix())
-
-    return change
-
-
-def _order(order: str) -> Callable[[Problem], Problem | None]:
-    def change(p: Problem) -> Problem | None:
-        axes, angles = _angles(p)
-        # every order about fixed axes is the reversed one about moved axes
-        moved = axes if axes.isupper() else axes[::-1].upper()
-        if order == moved:
-            return None
-        columns = angles if axes.isupper() else angles[:, ::-1]
-        by_axis = {a: columns[:, i] for i, a in enumerate(moved)}
-        return _rotated(p, Rotation.from_euler(order, np.column_stack([by_axis[a] for a in order])).as_matrix())
-
-    return change
-
-
-def _angle_factor(factor: float) -> Callable[[Problem], Problem | None]:
-    def change(p: Problem) -> Problem | None:
-        axes, angles = _angles(p)
-        return _rotated(p, Rotation.from_euler(axes, factor * angles).as_matrix())
-
-    return change
+POSITION_UNITS = (("centimetres", "cm", 10.0), ("inches", "inch", 25.4), ("metres", "m", 1000.0))
+"""Units in which positions are written under columns that say mm: name, symbol, millimetres."""
 
 
 def _upside_down(p: Problem) -> Problem | None:
@@ -86,7 +32,7 @@ def _upside_down(p: Problem) -> Problem | None:
     return replace(p, x_D=np.ascontiguousarray(2 * centre - p.x_D), alpha=-p.alpha)
 
 
-def _image(matrix: tuple[tuple[int, int], tuple[int, int]]) -> Callable[[Problem], Problem | None]:
+def _image(matrix: tuple[tuple[int, int], tuple[int, int]]) -> Change:
     """The symmetry about the detector's centre whose linear part is `matrix`."""
     S = np.array(matrix, dtype=np.float64)
 
@@ -99,11 +45,11 @@ def _image(matrix: tuple[tuple[int, int], tuple[int, int]]) -> Callable[[Problem
     return change
 
 
-def _axes_signs(M: Any) -> Callable[[Problem], Problem | None]:
+def _positions(M: Sequence[Sequence[float]] | np.ndarray) -> Change:
     return lambda p: replace(p, t_MH=np.ascontiguousarray(p.t_MH @ np.asarray(M, dtype=np.float64).T))
 
 
-def _shift(du: float, dv: float) -> Callable[[Problem], Problem | None]:
+def _shift(du: float, dv: float) -> Change:
     return lambda p: replace(p, x_D=p.x_D + [du, dv])
 
 
@@ -113,7 +59,7 @@ def _inverse(p: Problem) -> Problem:
 
 
 def _inverse_rotation(p: Problem) -> Problem:
-    return _rotated(p, np.swapaxes(p.R_MH, 1, 2))
+    return rotated(p, np.swapaxes(p.R_MH, 1, 2))
 
 
 def _tool_translation(p: Problem) -> Problem:
@@ -124,7 +70,7 @@ def _base_translation(p: Problem) -> Problem:
     return replace(p, t_MH=np.ascontiguousarray((np.swapaxes(p.R_MH, 1, 2) @ p.t_MH[:, :, None])[..., 0]))
 
 
-def _lag(lag: int) -> Callable[[Problem], Problem | None]:
+def _lag(lag: int) -> Change:
     """The image of a row belongs to the pose `lag` rows further on, within its run."""
 
     def change(p: Problem) -> Problem | None:
@@ -134,7 +80,7 @@ def _lag(lag: int) -> Callable[[Problem], Problem | None]:
             for k, (r, i) in enumerate(zip(p.run, p.index, strict=True))
             if (int(r), int(i) + lag) in where
         ]
-        if len(pairs) < 5:
+        if len(pairs) < FEWEST_PAIRS:
             return None
         image, pose = (np.array(column) for column in zip(*pairs, strict=True))
         of_pose, of_image = p.select(pose), p.select(image)
@@ -143,157 +89,128 @@ def _lag(lag: int) -> Callable[[Problem], Problem | None]:
     return change
 
 
-def _alpha(sign: int, offset: float) -> Callable[[Problem], Problem | None]:
+def _alpha(sign: int, offset: float) -> Change:
     def change(p: Problem) -> Problem | None:
         return replace(p, alpha=sign * p.alpha + offset) if sign > 0 or p.alpha.any() else None
 
     return change
 
 
-_ROWS = "scanner.json: the other value of image_rows"
-_POSES = "poses.csv: "
-
-
-def _product(order: str) -> str:
-    return " ".join(f"R_{axis}" for axis in order.lower())
-
-
-def _order_cure(order: str) -> str:
-    named = [c.name for c in CONVENTIONS.values() if c.axes in (order, order[::-1].lower())]
-    if named:
-        return "# convention: " + " or ".join(named)
-    return f"rewrite the angles in a named convention; {_product(order)} has no name here"
-
-
-def _list() -> tuple[Rival, ...]:
-    image = [
-        Rival(
+def _images() -> list[Alternative]:
+    return [
+        Alternative(
             name="rows flipped",
             words="image rows run the other way",
-            cure=_ROWS,
+            remedy=ROWS,
             change=_image(((1, 0), (0, -1))),
             quick=True,
         ),
-        Rival(
+        Alternative(
             name="columns flipped",
             words="image columns run the other way",
-            cure="mirror the images left to right (the detector is read from behind)",
+            remedy="mirror the images left to right (the detector is read from behind)",
             change=_image(((-1, 0), (0, 1))),
             quick=True,
         ),
-        Rival(
+        Alternative(
             name="image turned by 180 degrees",
             words="rows and columns run the other way",
-            cure=f"{_ROWS} and mirror left to right",
+            remedy=f"{ROWS} and mirror left to right",
             change=_image(((-1, 0), (0, -1))),
             quick=True,
         ),
-        Rival(
+        Alternative(
             name="image transposed",
             words="rows and columns are exchanged",
-            cure="transpose the images (axis order [v, u])",
+            remedy="transpose the images (axis order [v, u])",
             change=_image(((0, 1), (1, 0))),
         ),
-        Rival(
+        Alternative(
             name="image turned by 90 degrees",
             words="the image is turned by a quarter turn",
-            cure="turn the images by 90 degrees",
+            remedy="turn the images by 90 degrees",
             change=_image(((0, -1), (1, 0))),
         ),
-        Rival(
+        Alternative(
             name="image turned by 270 degrees",
             words="the image is turned by three quarter turns",
-            cure="turn the images by 270 degrees",
+            remedy="turn the images by 270 degrees",
             change=_image(((0, 1), (-1, 0))),
         ),
-        Rival(
+        Alternative(
             name="image transposed and turned by 180 degrees",
-            words="rows and columns exchanged and reversed",
-            cure="transpose and turn the images",
+            words="rows and columns are exchanged and reversed",
+            remedy="transpose and turn the images",
             change=_image(((0, -1), (-1, 0))),
         ),
     ]
-    table = [
-        Rival(
+
+
+def _tables() -> list[Alternative]:
+    return [
+        Alternative(
             name="table sign",
             words="the table turns the other way",
-            cure=_POSES + "the sign of alpha_deg",
+            remedy=f"{POSES}the sign of alpha_deg",
             change=_alpha(-1, 0.0),
             quick=True,
         ),
-        Rival(
+        Alternative(
             name="image turned by 180 degrees and table sign",
-            words="the scanner stands upside down: images turned about the beam and the table turning the other way",
-            cure="check one labelled fact, such as an image before and after a move in +z",
+            words="the scanner is upside down: images turned about the beam and the table turning the other way",
+            remedy="check one labelled fact, such as an image before and after a move in +z",
             change=_upside_down,
             symmetry=True,
         ),
-        Rival(
+        Alternative(
             name="table zero",
             words="the table's zero lies elsewhere (5 degrees tried)",
-            cure="none needed while the scan uses the same zero",
+            remedy="none needed while the scan uses the same zero",
             change=_alpha(1, TABLE_OFFSET),
             symmetry=True,
         ),
     ]
-    axis = "UVW"
-    signs = []
-    for s in ((-1, 1, 1), (1, -1, 1), (1, 1, -1), (-1, -1, 1), (-1, 1, -1), (1, -1, -1), (-1, -1, -1)):
-        turned = "".join(a for a, one in zip(axis, s, strict=True) if one < 0)
-        signs.append(
-            Rival(
-                name=f"sign of {turned}",
-                words=f"rotation {' and '.join(turned)} counted the other way",
-                cure=_POSES + f"the sign of the angle columns {', '.join(turned)}",
-                change=_signs(s),
-                quick=len(turned) in (1, 3),
-            )
-        )
-    orders = [
-        Rival(
-            name=f"order {o}",
-            words=f"the angles are those of {_product(o)}",
-            cure=_POSES + _order_cure(o),
-            change=_order(o),
-            quick=o in ("ZYX", "XYZ"),
-        )
-        for o in EULER_ORDERS
-    ]
-    frames = [
-        Rival(
+
+
+def _frames() -> list[Alternative]:
+    return [
+        Alternative(
             name="pose inverted",
             words="the poses map base to plate, or it is the scanner that moves",
-            cure=_POSES + "invert every pose; where the scanner moves: --arrangement moving-scanner",
+            remedy=f"{POSES}invert every pose; where the scanner moves: --arrangement moving-scanner",
             change=_inverse,
             quick=True,
         ),
-        Rival(
+        Alternative(
             name="rotation inverted",
             words="only the rotations are transposed",
-            cure=_POSES + "transpose every rotation",
+            remedy=f"{POSES}transpose every rotation",
             change=_inverse_rotation,
             quick=True,
         ),
-        Rival(
+        Alternative(
             name="translation in the tool frame",
             words="translations run along the moved axes",
-            cure=_POSES + "turn the translations by the pose's rotation",
+            remedy=f"{POSES}turn the translations by the pose's rotation",
             change=_tool_translation,
             quick=True,
         ),
-        Rival(
+        Alternative(
             name="translation turned back",
             words="translations were written along fixed axes after turning",
-            cure=_POSES + "turn the translations back by the pose's rotation",
+            remedy=f"{POSES}turn the translations back by the pose's rotation",
             change=_base_translation,
         ),
     ]
+
+
+def _translations() -> list[Alternative]:
     swaps = [
-        Rival(
+        Alternative(
             name=f"{a} and {b} exchanged",
             words=f"the translation columns {a} and {b} are exchanged",
-            cure=_POSES + f"exchange the columns {a}_mm and {b}_mm",
-            change=_axes_signs(M),
+            remedy=f"{POSES}exchange the columns {a}_mm and {b}_mm",
+            change=_positions(M),
         )
         for a, b, M in (
             ("x", "y", [[0, 1, 0], [1, 0, 0], [0, 0, 1]]),
@@ -302,76 +219,91 @@ def _list() -> tuple[Rival, ...]:
         )
     ]
     senses = [
-        Rival(
+        Alternative(
             name=f"sign of {''.join(n)}",
             words=f"translation {' and '.join(n)} counted the other way",
-            cure=_POSES + "the sign of " + ", ".join(f"{c}_mm" for c in n),
-            change=_axes_signs(np.diag([-1.0 if c in n else 1.0 for c in "xyz"])),
+            remedy=f"{POSES}the sign of " + ", ".join(f"{c}_mm" for c in n),
+            change=_positions(np.diag([-1.0 if c in n else 1.0 for c in "xyz"])),
         )
         for n in ("x", "y", "z", "xyz")
     ]
-    lags = [
-        Rival(
+    units = [
+        Alternative(
+            name=f"positions in {name}",
+            words=f"the positions are in {name} ({symbol}), not in millimetres",
+            remedy=f"{POSES}multiply x_mm, y_mm and z_mm by {factor:g}",
+            change=_positions(factor * np.eye(3)),
+            quick=True,
+            length_factor=factor,
+        )
+        for name, symbol, factor in POSITION_UNITS
+    ]
+    return [*swaps, *senses, *units]
+
+
+def _pairings() -> list[Alternative]:
+    return [
+        Alternative(
             name=f"pairing lag {lag:+d}",
             words=f"each image belongs to the pose {abs(lag)} {'later' if lag > 0 else 'earlier'}",
-            cure="pair images and poses by name (column image or pose_id)",
+            remedy="pair images and poses by name (column image or pose_id)",
             change=_lag(lag),
             quick=abs(lag) == 1,
         )
         for lag in (-3, -2, -1, 1, 2, 3)
     ]
-    units = [
-        Rival(
-            name="angles are radians",
-            words="the angles read as degrees are radians",
-            cure=_POSES + "convert the angles to degrees",
-            change=_angle_factor(180.0 / np.pi),
-        ),
-        Rival(
-            name="angles are degrees",
-            words="the angles read as radians are degrees",
-            cure=_POSES + "convert the angles to radians",
-            change=_angle_factor(np.pi / 180.0),
-        ),
-        Rival(
+
+
+def _pixels() -> list[Alternative]:
+    return [
+        Alternative(
             name="half a pixel low",
             words="(0, 0) is a pixel's corner: u and v are half a pixel too high",
-            cure="observations.csv: subtract 0.5 px from u_px and v_px",
+            remedy="observations.csv: subtract 0.5 px from u_px and v_px",
             change=_shift(-0.5, -0.5),
         ),
-        Rival(
+        Alternative(
             name="half a pixel high",
             words="u and v are half a pixel too low",
-            cure="observations.csv: add 0.5 px to u_px and v_px",
+            remedy="observations.csv: add 0.5 px to u_px and v_px",
             change=_shift(0.5, 0.5),
         ),
-        Rival(
+        Alternative(
             name="pixels counted from 1",
             words="pixels are counted from 1",
-            cure="observations.csv: subtract 1 px from u_px and v_px",
+            remedy="observations.csv: subtract 1 px from u_px and v_px",
             change=_shift(-1.0, -1.0),
         ),
     ]
-    return (*image, *table, *signs, *orders, *frames, *swaps, *senses, *lags, *units)
 
 
-RIVALS = _list()
+ALTERNATIVES = (
+    *_images(),
+    *_tables(),
+    *_frames(),
+    *_translations(),
+    *_pairings(),
+    *_pixels(),
+    *orientation_alternatives(),
+)
 
 
-def _over_inverse(rival: Rival) -> Rival:
+def _over_inverse(alternative: Alternative) -> Alternative:
     def change(p: Problem) -> Problem | None:
-        changed = rival.change(_inverse(p))
+        changed = alternative.change(_inverse(p))
         return None if changed is None else _inverse(changed)
 
-    if rival.name != "pose inverted":
-        return replace(rival, change=change)
+    if alternative.name != "pose inverted":
+        return replace(alternative, change=change)
     return replace(
-        rival,
+        alternative,
         change=change,
         words="the object moves and the scanner stands still, or the poses map base to plate",
-        cure="leave out --arrangement moving-scanner, or poses.csv: invert every pose",
+        remedy="leave out --arrangement moving-scanner, or poses.csv: invert every pose",
     )
 
 
-RIVALS_OF_MOVING_SCANNER = tuple(_over_inverse(rival) for rival in RIVALS)
-"""The same readings of a table whose inverse poses stand in the problem."""
+ALTERNATIVES_OF_MOVING_SCANNER = tuple(_over_inverse(alternative) for alternative in ALTERNATIVES)
+"""The same readings of a table whose inverse poses are those of the problem."""
+
+RIVALS, RIVALS_OF_MOVING_SCANNER, Rival = ALTERNATIVES, ALTERNATIVES_OF_MOVING_SCANNER, Alternative

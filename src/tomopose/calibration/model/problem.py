@@ -10,12 +10,15 @@ import numpy as np
 
 from tomopose.calibration.model.ball_projection import scanner_vector, whiteners
 from tomopose.errors import InputError
+from tomopose.geometry.rotations import rotation_angle_between, rotation_from_convention
 from tomopose.geometry.scanner import Scanner
 from tomopose.manipulator.poses import PIVOT_TOLERANCE_MM, PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.units import Array
 
 FEWEST_POSES = 5
+SAME_ROTATION_RAD = 1e-6
+"""Ten digits of a file leave 2e-9 rad; corrected poses differ by more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +29,8 @@ class Problem:
     R_MH (n, 3, 3), t_MH (n, 3), alpha (n,): the poses.  ball (n,): index into ball_ids.
     x_D (n, 2) px, covariance (n, 2, 2) px^2, W (n, 2, 2) its whitener.
     not_seen: ids of poses whose ball was not measured, with the reason.
+    orientations (n, 3 or 4): the orientation columns as written, in the convention's unit, or None.
+    units_confirmed: the user says that unusual magnitudes of the poses are right.
     """
 
     scanners: tuple[Scanner, ...]
@@ -44,6 +49,8 @@ class Problem:
     time_utc: tuple[str, ...] | None = None
     pivot: Array | None = None
     convention: str = "pi-hexapod"
+    orientations: Array | None = None
+    units_confirmed: bool = False
 
     def __len__(self) -> int:
         return len(self.pose_id)
@@ -69,11 +76,35 @@ class Problem:
             **rows,
             pose_id=tuple(self.pose_id[i] for i in k),
             time_utc=None if self.time_utc is None else tuple(self.time_utc[i] for i in k),
+            orientations=None if self.orientations is None else self.orientations[k],
         )
 
     def with_covariance(self, covariance: Array) -> Problem:
         """The same centres with other covariances (n, 2, 2)."""
         return replace(self, covariance=covariance, W=whiteners(covariance))
+
+
+def rotated(problem: Problem, R: Array) -> Problem:
+    """The same centres and translations under the rotations R (n, 3, 3)."""
+    return replace(problem, R_MH=np.ascontiguousarray(R))
+
+
+def _written_orientations(runs: Sequence[PoseSequence], rows: Sequence[Array]) -> Array | None:
+    """(n, 3 or 4) orientation columns where every run still holds those of its own poses, in one convention.
+
+    Poses that were replaced since they were read, by corrected ones for example, no longer belong to the columns; an
+    inverse table (the scanner moves) does.
+    """
+    parts = []
+    for poses, k in zip(runs, rows, strict=True):
+        if poses.orientations is None or poses.convention != runs[0].convention:
+            return None
+        R = rotation_from_convention(np.array(poses.orientations), poses.convention)
+        apart = min(rotation_angle_between(R, T).max() for T in (poses.T_MH.R, np.swapaxes(poses.T_MH.R, 1, 2)))
+        if apart > SAME_ROTATION_RAD:
+            return None
+        parts.append(poses.orientations[k])
+    return np.concatenate(parts)
 
 
 def _as_runs(value: Any, kind: type) -> list[Any]:
@@ -157,4 +188,6 @@ def pair(
         time_utc=tuple(times) if len(times) == n else None,
         pivot=pivots[0] if pivots else None,
         convention=runs_p[0].convention,
+        orientations=_written_orientations(runs_p, parts["index"]),
+        units_confirmed=all(p.units_confirmed for p in runs_p),
     )

@@ -1,0 +1,72 @@
+"""Where a fit places the balls between focal spot and panel, and whether a ball can be there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.rigid.fit import Fit
+from tomopose.units import Array
+
+LIKELY = 2.5
+"""A ball on the manipulator is taken to be within this factor of the rotation axis' distance from the focal spot."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placement:
+    """Distances of the balls from the focal spot along the beam, mm: nearest, median, farthest.
+
+    d_SD, d_SR: of the scanner, mm.
+    """
+
+    nearest: float
+    median: float
+    farthest: float
+    d_SD: float
+    d_SR: float
+
+    @property
+    def possible(self) -> bool:
+        """Between focal spot and panel in every pose."""
+        return 0.0 < self.nearest and self.farthest < self.d_SD
+
+    @property
+    def off_axis(self) -> float:
+        """|ln| of the median distance over d_SR; inf where the ball cannot be there at all."""
+        return float(abs(np.log(self.median / self.d_SR))) if self.median > 0 else float("inf")
+
+    @property
+    def likely(self) -> bool:
+        return self.possible and self.off_axis < np.log(LIKELY)
+
+
+def depths(problem: Problem, fit: Fit) -> Array:
+    """(n,) mm: distance of the ball from the focal spot along the beam, in every pose."""
+    x_H = (problem.R_MH @ fit.t[problem.ball][:, :, None])[..., 0] + problem.t_MH
+    x_T = x_H @ fit.R_HT.T + fit.t_HT
+    found = np.empty(len(problem))
+    for r, scanner in enumerate(problem.scanners):
+        mine = problem.run == r
+        T_TS = scanner.T_WS @ scanner.T_TW(problem.alpha[mine])
+        found[mine] = np.einsum("nj,nj->n", T_TS.R[:, 2], x_T[mine]) + T_TS.t[:, 2]
+    return found
+
+
+def placement(problem: Problem, fit: Fit) -> Placement:
+    """Of a fit."""
+    z = depths(problem, fit)
+    first = problem.scanners[problem.run[0]]
+    return Placement(
+        nearest=float(z.min()),
+        median=float(np.median(z)),
+        farthest=float(z.max()),
+        d_SD=min(s.d_SD for s in problem.scanners),
+        d_SR=first.d_SR,
+    )
+
+
+def better_placed(other: Placement, declared: Placement) -> bool:
+    """Whether `other` has the ball near the rotation axis where `declared` has it far from there."""
+    return other.possible and not declared.likely and other.off_axis < declared.off_axis
