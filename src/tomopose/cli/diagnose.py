@@ -67,4 +67,4 @@ def diagnose(
         },
         [*lines, *found.advice],
     )
-    return NOT_TRUSTWORTHY if found.better else OK
+    return OK if found.as_declared else NOT_TRUSTWORTHY

@@ -1,4 +1,4 @@
-"""An alternative convention: the same data under another reading, and the line of the input that would have to change."""
+"""An alternative convention: the same data under another reading, and the line of the input that would change."""
 
 from __future__ import annotations
 

@@ -78,7 +78,8 @@ class Hypothesis:
     d_rms: px, eq. (8);  chi2, dof: of its fit;  sigmas: rms residual in stated standard uncertainties, of the 80 % that
     fit best;  delta: see above, 0 for the declared reading;  factor: chi2 of the declared reading over the
     alternative's, both floored at dof;  outcome: declared | better | same | worse | unfit;  symmetry: no plan could
-    distinguish it;  length_factor: of `Alternative`;  ball_mm: distance of the ball from the focal spot, median.
+    distinguish it;  length_factor: of `Alternative`;  ball_mm: distance of the ball from the focal spot, median;
+    off_axis: |ln| of ball_mm over d_SR.
     """
 
     name: str
@@ -94,6 +95,7 @@ class Hypothesis:
     symmetry: bool = False
     length_factor: float = 1.0
     ball_mm: float = float("nan")
+    off_axis: float = float("inf")
 
     @property
     def cure(self) -> str:
@@ -150,9 +152,10 @@ class Diagnosis:
         return self.named("same")
 
     @property
-    def other_units(self) -> tuple[Hypothesis, ...]:
-        """Units of the positions that fit as well as millimetres and place the ball where a scanner has it."""
-        return tuple(h for h in self.same if h.length_factor != 1.0)
+    def other_unit(self) -> Hypothesis | None:
+        """The unit of the positions that fits as well as millimetres and places the ball where a scanner has it."""
+        units = [h for h in self.same if h.length_factor != 1.0]
+        return min(units, key=lambda h: h.off_axis, default=None)
 
     @property
     def nothing_fits(self) -> bool:
@@ -163,6 +166,11 @@ class Diagnosis:
     def meaningless(self) -> bool:
         """Whether nothing fits and the declared reading explains the images hardly better than chance."""
         return self.nothing_fits and self.declared.d_rms > MEANINGLESS_SHARE * self.spread
+
+    @property
+    def as_declared(self) -> bool:
+        """Whether the declared reading fits and no alternative fits better or is likelier."""
+        return not self.better and self.declared.fits and self.other_unit is None
 
     @property
     def leading(self) -> tuple[Hypothesis, ...]:
@@ -194,7 +202,8 @@ class Diagnosis:
         if self.nothing_fits:
             lines.append(self.nothing_fits_words)
         if not lines:
-            lines += [other_unit_words(h, self.declared) for h in self.other_units]
+            if self.other_unit is not None:
+                lines.append(other_unit_words(self.other_unit, self.declared))
             alike = [h.name for h in self.same if not h.symmetry and h.length_factor == 1.0]
             if alike:
                 lines.append(f"cannot be distinguished with these poses: {', '.join(alike)}")
@@ -207,8 +216,8 @@ class Diagnosis:
 def other_unit_words(h: Hypothesis, declared: Hypothesis) -> str:
     """Why another unit of the positions is the likelier one, and what would settle it."""
     return (
-        f"{h.words}: fits as well, and places the ball {h.ball_mm:.4g} mm from the focal spot, near the rotation axis, "
-        f"where millimetres place it at {declared.ball_mm:.4g} mm; to try: {h.remedy}. The ball's diameter with the "
+        f"{h.words}: fits as well, and places the ball {h.ball_mm:.4g} mm from the focal spot, nearer to the rotation "
+        f"axis, where millimetres place it at {declared.ball_mm:.4g} mm; to try: {h.remedy}. The ball's diameter with the "
         "outlines' semi axes, or another table angle, settles it; '# units: confirmed' in poses.csv says that they are "
         "millimetres"
     )
@@ -279,6 +288,7 @@ class _Declared:
             factor=1.0,
             outcome="declared",
             ball_mm=self.placed.median,
+            off_axis=self.placed.off_axis,
         )
 
 
@@ -377,6 +387,7 @@ def _judged(
         symmetry=alternative.symmetry,
         length_factor=alternative.length_factor,
         ball_mm=placed.median,
+        off_axis=placed.off_axis,
     )
 
 

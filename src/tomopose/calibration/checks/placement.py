@@ -30,7 +30,7 @@ class Placement:
     @property
     def possible(self) -> bool:
         """Between focal spot and panel in every pose."""
-        return 0.0 < self.nearest and self.farthest < self.d_SD
+        return self.nearest > 0.0 and self.farthest < self.d_SD
 
     @property
     def off_axis(self) -> float:
