@@ -1,4 +1,4 @@
-"""Could the data have been written in another convention?  Every alternative is fitted and ranked; none is ever applied.
+"""Could the data have been written in another convention?  Every alternative is fitted and ranked, none is applied.
 
 The measure is delta = (chi2_alternative - chi2_declared) / max(1, min of both / dof), both for the same number of
 equations.  An alternative that fits better and still leaves a drift or a step in time is compared again with both free
@@ -38,8 +38,8 @@ SAME, BETTER = 9.0, 25.0
 """delta below SAME (3 sigma): cannot be distinguished.  delta below -BETTER (5 sigma): the alternative fits better."""
 
 GOOD_CHI2, CLEARLY = 4.0, 1.5
-"""Where the alternative, too, leaves chi2/dof above GOOD_CHI2, poses or sigmas are wrong in ways of their own, and delta
-has no such meaning: the alternative must lower chi2 by the factor CLEARLY to count as better."""
+"""Where the alternative, too, leaves chi2/dof above GOOD_CHI2, poses or sigmas are wrong in ways of their own, and
+delta has no such meaning: the alternative must lower chi2 by the factor CLEARLY to count as better."""
 
 FITS_SIGMAS = 10.0
 """A reading whose centres lie more than this many stated standard uncertainties away explains nothing.  Wrong readings
@@ -79,7 +79,7 @@ class Hypothesis:
     fit best;  delta: see above, 0 for the declared reading;  factor: chi2 of the declared reading over the
     alternative's, both floored at dof;  outcome: declared | better | same | worse | unfit;  symmetry: no plan could
     distinguish it;  length_factor: of `Alternative`;  ball_mm: distance of the ball from the focal spot, median;
-    off_axis: |ln| of ball_mm over d_SR.
+    off_axis: |ln| of ball_mm over d_SR;  possible: every ball is between focal spot and panel.
     """
 
     name: str
@@ -96,6 +96,7 @@ class Hypothesis:
     length_factor: float = 1.0
     ball_mm: float = float("nan")
     off_axis: float = float("inf")
+    possible: bool = True
 
     @property
     def cure(self) -> str:
@@ -127,14 +128,13 @@ class Hypothesis:
 class Diagnosis:
     """Hypotheses ranked by fit, best first; the declared reading is among them.
 
-    spread: px, rms distance of the centres from their mean;  placed: where the declared reading puts the balls.
+    spread: px, rms distance of the centres from their mean.
     better: alternatives that fit significantly better;  same: those that these poses cannot distinguish from the
     declared reading.
     """
 
     hypotheses: tuple[Hypothesis, ...]
     spread: float = float("inf")
-    placed: Placement | None = None
 
     def named(self, outcome: str) -> tuple[Hypothesis, ...]:
         return tuple(h for h in self.hypotheses if h.outcome == outcome)
@@ -187,9 +187,9 @@ class Diagnosis:
         """Says how far the best reading is from fitting."""
         best = min(self.hypotheses, key=lambda h: h.sigmas)
         return (
-            f"nothing fits: the best of {len(self.hypotheses)} readings ({best.words}) still leaves {best.d_rms:.3g} px, "
-            f"{best.sigmas:.3g} stated standard uncertainties, where {FITS_SIGMAS:g} are the limit; no convention is "
-            "advised. Check that images and poses belong together, the values in scanner.json, the centres' sigmas and "
+            f"nothing fits: the best of {len(self.hypotheses)} readings ({best.words}) still leaves "
+            f"{best.d_rms:.3g} px, {best.sigmas:.3g} stated standard uncertainties, where {FITS_SIGMAS:g} are the "
+            "limit; no convention is advised. Check that images and poses belong together, the values in scanner.json, the centres' sigmas and "
             "whether the manipulator reaches the poses it reports"
         )
 
@@ -217,9 +217,9 @@ def other_unit_words(h: Hypothesis, declared: Hypothesis) -> str:
     """Why another unit of the positions is the likelier one, and what would settle it."""
     return (
         f"{h.words}: fits as well, and places the ball {h.ball_mm:.4g} mm from the focal spot, nearer to the rotation "
-        f"axis, where millimetres place it at {declared.ball_mm:.4g} mm; to try: {h.remedy}. The ball's diameter with the "
-        "outlines' semi axes, or another table angle, settles it; '# units: confirmed' in poses.csv says that they are "
-        "millimetres"
+        f"axis, where millimetres place it at {declared.ball_mm:.4g} mm; to try: {h.remedy}. The ball's diameter with "
+        "the outlines' semi axes, or another table angle, settles it; '# units: confirmed' in poses.csv says that they "
+        "are millimetres"
     )
 
 
@@ -289,6 +289,7 @@ class _Declared:
             outcome="declared",
             ball_mm=self.placed.median,
             off_axis=self.placed.off_axis,
+            possible=self.placed.possible,
         )
 
 
@@ -321,7 +322,7 @@ def ranked(
         if judged is not None:
             found.append(judged)
     spread = float(np.sqrt(((problem.x_D - problem.x_D.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    return Diagnosis(hypotheses=tuple(sorted(found, key=_rank)), spread=spread, placed=declared.placed)
+    return Diagnosis(hypotheses=tuple(sorted(found, key=_rank)), spread=spread)
 
 
 def _rank(h: Hypothesis) -> tuple[int, float]:
@@ -366,10 +367,10 @@ def _judged(
     sigmas = min(residual_sigmas(changed, free, other), float(np.sqrt(other.chi2 / dof_a)))
     believable = chi2_a < GOOD_CHI2 * dof or factor > CLEARLY
     better = delta < -BETTER and believable
-    if alternative.length_factor != 1.0 and not (better and placed.possible):
-        # centres alone cannot show the unit while the table stands still; where the ball stands can
-        if changed.units_confirmed or not placed.possible or not better_placed(placed, declared.placed):
-            return None
+    likelier = better_placed(placed, declared.placed) and not changed.units_confirmed
+    if alternative.length_factor != 1.0 and not likelier and not (better and placed.possible):
+        # centres alone cannot show the unit while the table keeps one angle; the ball's place on the beam can
+        return None
     outcome = "better" if better else "same" if delta < SAME else "worse"
     if outcome != "worse" and not (sigmas <= FITS_SIGMAS and placed.possible):
         outcome = "unfit"
@@ -388,6 +389,7 @@ def _judged(
         length_factor=alternative.length_factor,
         ball_mm=placed.median,
         off_axis=placed.off_axis,
+        possible=placed.possible,
     )
 
 
