@@ -189,8 +189,8 @@ class Diagnosis:
         return (
             f"nothing fits: the best of {len(self.hypotheses)} readings ({best.words}) still leaves "
             f"{best.d_rms:.3g} px, {best.sigmas:.3g} stated standard uncertainties, where {FITS_SIGMAS:g} are the "
-            "limit; no convention is advised. Check that images and poses belong together, the values in scanner.json, the centres' sigmas and "
-            "whether the manipulator reaches the poses it reports"
+            "limit; no convention is advised. Check that images and poses belong together, the values in "
+            "scanner.json, the centres' sigmas and whether the manipulator reaches the poses it reports"
         )
 
     @property
