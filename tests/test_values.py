@@ -75,7 +75,7 @@ def test_observations_that_contradict_themselves(rng, change, error, message):
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"pose_id": ["a", "a", "b"]}, InputError, "stands more than once"),
+        ({"pose_id": ["a", "a", "b"]}, InputError, "appears more than once"),
         ({"alpha": [0.0, np.nan, 0.0]}, InputError, "alpha of pose '1' is not finite"),
         ({"alpha": [0.0]}, ShapeError, "one value for each of 3 poses"),
         ({"image": ["a.tif"]}, ShapeError, "1 entries in image"),

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.units import Array, float_array, rows_at
+from tomopose.values import Column, Rows, value
 
 OPTIONAL_COLUMNS = ("snr", "semi_major", "semi_minor", "angle")
 
 
-@dataclass(frozen=True, kw_only=True)
-class BallObservations:
+@value
+class BallObservations(Rows):
     """One row per image.
 
     x_D:        (n, 2) px in D, projection of the ball's *centre*; NaN where not seen.
@@ -99,8 +100,19 @@ class BallObservations:
         ids = range(len(x_D)) if pose_id is None else pose_id
         return cls(x_D=x_D, covariance=covariance, pose_id=tuple(str(i) for i in ids), **columns)
 
-    def __len__(self) -> int:
-        return len(self.pose_id)
+    def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> Array:
+        return np.array(self.x_D, dtype=dtype)
+
+    def columns(self) -> dict[str, Column]:
+        """The columns of observations.csv, angles in rad."""
+        sigma = self.sigma
+        columns: dict[str, Column] = {
+            "u_px": self.x_D[:, 0], "v_px": self.x_D[:, 1], "sigma_u_px": sigma[:, 0], "sigma_v_px": sigma[:, 1],
+            "seen": self.seen, "status": self.status or (),
+        }  # fmt: skip
+        units = {"snr": "snr", "semi_major": "semi_major_px", "semi_minor": "semi_minor_px", "angle": "angle_rad"}
+        given = {units[name]: getattr(self, name) for name in OPTIONAL_COLUMNS}
+        return columns | {name: held for name, held in given.items() if held is not None}
 
     @property
     def sigma(self) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,10 @@ import numpy as np
 from tomopose.errors import InputError, ShapeError
 from tomopose.provenance import Provenance
 from tomopose.units import Array, float_array
+from tomopose.values import value
 
 
-@dataclass(frozen=True, kw_only=True)
+@value(kw_only=False)
 class VoxelGrid:
     """A grid of voxels along the axes of W.
 
@@ -101,7 +102,7 @@ class VoxelGrid:
         return replace(self, shape=(z_1 - z_0, *self.shape[1:]), centre=centre)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@value(kw_only=False)
 class Volume:
     """A reconstructed volume in frame W.
 
@@ -129,6 +130,9 @@ class Volume:
             object.__setattr__(self, "view_residual", float_array(self.view_residual))
         object.__setattr__(self, "notes", tuple(self.notes))
         object.__setattr__(self, "settings", dict(self.settings))
+
+    def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> np.ndarray:
+        return self.values.astype(dtype or self.values.dtype, copy=bool(copy))
 
     def slices(self, at: Any = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Three orthogonal slices through voxel `at` (iz, iy, ix), the middle unless given: [y, x], [z, x], [z, y]."""

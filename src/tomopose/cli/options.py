@@ -14,7 +14,6 @@ typer.Option(...)]` with the default of the field.  Groups of options that sever
 
 from __future__ import annotations
 
-import functools
 import inspect
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields
@@ -84,7 +83,6 @@ def add_command(app: typer.Typer, name: str, verb: Callable[[T], int], *, epilog
     kind = get_type_hints(verb)["options"]
     hints = get_type_hints(kind, include_extras=True)
 
-    @functools.wraps(verb)
     def command(**values: object) -> int:
         return verb(kind(**values))
 
@@ -97,9 +95,9 @@ def add_command(app: typer.Typer, name: str, verb: Callable[[T], int], *, epilog
         )
         for f in sorted(fields(kind), key=lambda f: _place(kind, f.name))
     ]
-    del command.__wrapped__
-    command.__signature__ = inspect.Signature(parameters, return_annotation=int)
+    command.__doc__ = verb.__doc__
     command.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": int}
+    vars(command)["__signature__"] = inspect.Signature(parameters, return_annotation=int)
     app.command(name, epilog=epilog)(command)
 
 

@@ -188,14 +188,16 @@ def planned_for_mount(o: Options, scanner: Scanner) -> Planned:
         "paper_189_px": plan.reference,
         "u": dict(plan.u),
         "duration_s": plan.duration,
-        "not_shown": [h.name for h in told.unresolved],
-        "symmetries": [h.name for h in told.symmetric],
+        "not_shown": [h.name for h in told.unresolved] if told else [],
+        "symmetries": [h.name for h in told.symmetric] if told else [],
     }
     expected = (
         f"  predicted scan reprojection error {plan.predicted:.4f} px (the paper's 189 poses: "
         f"{plan.reference:.4f} px), about {plan.duration / 60:.0f} minutes"
     )
-    return Planned(poses=plan.poses, summary=summary, lines=(expected, *(f"  {words}" for words in told.words)))
+    return Planned(
+        poses=plan.poses, summary=summary, lines=(expected, *(f"  {words}" for words in (told.words if told else ())))
+    )
 
 
 OPTIMAL = {"rigid": planned_for_mount, "kinematic": planned_to_identify}

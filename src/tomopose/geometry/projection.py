@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,8 @@ from tomopose.errors import InputError, OutOfViewError, ShapeError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.units import Array, float_array
+from tomopose.units import Array, float_array, rows_at
+from tomopose.values import Column, Rows, value
 
 PANEL_TOLERANCE = 1e-7
 """Largest relative skew and aspect error of a matrix that still counts as a flat panel of rectangular pixels."""
@@ -107,7 +107,7 @@ def canonical(P: Any, in_front: Any = (0.0, 0.0, 0.0)) -> Array:
     return P * (sign / norm)[..., None, None]
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class ViewGeometry:
     """Source and panel of each view, in W, mm: what vector formats hold.
 
@@ -182,8 +182,8 @@ def row_flip(n_v: int) -> Array:
     return np.array([[1.0, 0.0, 0.0], [0.0, -1.0, n_v - 1.0], [0.0, 0.0, 1.0]])
 
 
-@dataclass(frozen=True, kw_only=True)
-class ProjectionMatrices:
+@value
+class ProjectionMatrices(Rows):
     """Projection matrices of a scan: points of W (mm) to pixels of D.
 
     P: (n, 3, 4), kept at |P[2, :3]| = 1, w > 0.  n_u, n_v: detector size.  p_u, p_v: pitch, mm (P does not fix it).
@@ -231,8 +231,15 @@ class ProjectionMatrices:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, float_array(getattr(self, name)))
 
-    def __len__(self) -> int:
-        return len(self.P)
+    def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> Array:
+        return np.array(self.P, dtype=dtype)
+
+    def columns(self) -> dict[str, Column]:
+        """The twelve numbers of each view's matrix, row by row, and the predicted uncertainty where there is one."""
+        columns: dict[str, Column] = {f"P_{i}{j}": self.P[:, i, j] for i in range(3) for j in range(4)}
+        if self.points_sigma is not None:
+            columns["points_sigma_rms_px"] = np.sqrt(np.mean(self.points_sigma**2, axis=1))
+        return columns
 
     def project(self, x_W: Any) -> Array:
         """Pixels (n, m, 2) of points (m, 3) in W."""
@@ -246,9 +253,9 @@ class ProjectionMatrices:
         """The matrices for arrays whose row 0 is the top: F P."""
         return row_flip(self.n_v) @ self.P
 
-    def select(self, views: Sequence[int]) -> ProjectionMatrices:
-        """The views with those indices, in that order."""
-        index = np.asarray(views, dtype=np.intp)
+    def select(self, index: object) -> ProjectionMatrices:
+        """The views with those indices (or that mask or slice), in that order."""
+        index = rows_at(len(self), index)
         return replace(
             self,
             P=self.P[index],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from types import MappingProxyType
 from typing import Literal
 
@@ -15,6 +15,7 @@ from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import R_x, R_y, R_z
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
+from tomopose.values import value
 
 R_WS = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
 """Rotation part of eq. (4)."""
@@ -41,7 +42,7 @@ PARAMETER_UNITS: Mapping[str, str] = MappingProxyType(
 """Every continuous parameter of a scanner and its unit; in files the name is `NAME_UNIT`."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Scanner:
     """Intrinsic geometry of a cone-beam scanner.
 

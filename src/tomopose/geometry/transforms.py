@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,11 +11,12 @@ from tomopose.errors import FrameMismatchError, InputError, ShapeError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import angles_from_rotation, log_rotation, rotation_from_angles, skew
 from tomopose.units import Array, float_array
+from tomopose.values import value
 
 ORTHONORMAL_TOLERANCE = 1e-6
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class RigidTransform:
     """x_target = R x_source + t.  Eq. (1).  One transform, or a sequence of them along a leading axis.
 
@@ -107,6 +107,9 @@ class RigidTransform:
         if x.ndim == 1:
             return self.R @ x + self.t
         return np.einsum("nij,mj->nmi", self.R, x) + self.t[:, None, :]
+
+    def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> Array:
+        return np.array(self.matrix, dtype=dtype)
 
     # -- group -------------------------------------------------------------------------------------------------------
 

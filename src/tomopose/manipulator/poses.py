@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -14,12 +14,13 @@ from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import log_rotation, rotation_from_convention
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array, float_array, rows_at
+from tomopose.values import Column, Rows, value
 
 PIVOT_TOLERANCE_MM = 1e-6
 
 
-@dataclass(frozen=True, kw_only=True)
-class PoseSequence:
+@value
+class PoseSequence(Rows):
     """n poses of the manipulator and the table, in acquisition order.
 
     T_MH:      moved plate -> base, n transforms; the encoder's values where there are any (`source`).
@@ -59,7 +60,7 @@ class PoseSequence:
             raise ShapeError(f"{n} poses but {len(ids)} pose ids")
         twice = [i for i, count in Counter(ids).items() if count > 1]
         if twice:
-            raise InputError(f"pose_id {twice[0]!r} stands more than once ({len(twice)} ids repeat); ids must differ")
+            raise InputError(f"pose_id {twice[0]!r} appears more than once ({len(twice)} ids repeat); ids must differ")
         object.__setattr__(self, "pose_id", ids)
         alpha = np.zeros(n) if self.alpha is None else np.asarray(self.alpha, dtype=np.float64)
         ball_id = np.zeros(n, dtype=np.int64) if self.ball_id is None else np.array(self.ball_id, dtype=np.int64)
@@ -92,8 +93,17 @@ class PoseSequence:
                 raise ShapeError(f"orientations has shape {written.shape}; one row for each of {n} poses is needed")
             object.__setattr__(self, "orientations", written)
 
-    def __len__(self) -> int:
-        return len(self.pose_id)
+    def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> Array:
+        return np.array(self.T_MH.matrix, dtype=dtype)
+
+    def columns(self) -> dict[str, Column]:
+        """The columns of poses.csv by the paper's convention, R = R_x R_y R_z, degrees."""
+        angles = np.degrees(self.T_MH.angles)
+        columns: dict[str, Column] = {f"{c}_mm": self.T_MH.t[:, k] for k, c in enumerate("xyz")}
+        columns |= {f"r{c}_deg": angles[:, k] for k, c in enumerate("xyz")}
+        columns |= {"alpha_deg": np.degrees(self.alpha), "ball_id": self.ball_id}
+        given = {"image": self.image, "time_utc": self.time_utc}
+        return columns | {name: held for name, held in given.items() if held is not None}
 
     @classmethod
     def from_table(
@@ -141,17 +151,6 @@ class PoseSequence:
             q=None if self.q is None else self.q[i],
             orientations=None if self.orientations is None else self.orientations[i],
         )
-
-    def index_of(self, pose_id: Sequence[str]) -> np.ndarray:
-        """Indices of those poses; InputError names an id that is not here."""
-        where = {p: k for k, p in enumerate(self.pose_id)}
-        unknown = [p for p in pose_id if p not in where]
-        if unknown:
-            raise InputError(
-                f"{len(unknown)} pose ids are not in the pose table, the first is {unknown[0]!r}; "
-                f"the table holds {len(self)} poses from {self.pose_id[0]!r} to {self.pose_id[-1]!r}"
-            )
-        return np.array([where[p] for p in pose_id], dtype=np.intp)
 
     def set_poses(self) -> PoseSequence:
         """The same sequence with the commanded poses in place of the encoder's."""

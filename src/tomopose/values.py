@@ -1,0 +1,215 @@
+"""Values that one can hold: frozen, compared by content, shown on one screen, read as tables.
+
+`@value` makes a frozen, keyword-only dataclass with
+
+    ==, hash     by content: arrays element by element (NaN equals NaN, 0.0 equals -0.0), never by identity;
+    repr         one line a field, arrays by shape and range; `_repr_html_` the same as a table, for notebooks.
+
+`Rows` adds to a value of n rows with names: len, indexing by number, by pose id, by slice or mask, iteration, and
+`to_dataframe`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import html
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, TypeVar, dataclass_transform, overload
+
+import numpy as np
+
+from tomopose.errors import EngineMissingError, InputError
+
+if TYPE_CHECKING:
+    import pandas
+
+T = TypeVar("T")
+Column = Sequence[object] | np.ndarray
+R = TypeVar("R", bound="Rows")
+
+SHOWN = 96
+"""Characters of a field in a repr; longer ones are cut with an ellipsis, so that a value fits one screen."""
+
+
+def equal(a: object, b: object) -> bool:
+    """Whether two fields hold the same: arrays, mappings and sequences by content, NaN equal to NaN."""
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        a, b = np.asarray(a), np.asarray(b)
+        if a.shape != b.shape or a.dtype.kind != b.dtype.kind:
+            return False
+        return bool(np.array_equal(a, b, equal_nan=a.dtype.kind in "fc"))
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return a.keys() == b.keys() and all(equal(v, b[k]) for k, v in a.items())
+    if isinstance(a, (list, tuple)) and isinstance(b, (list, tuple)):
+        return len(a) == len(b) and all(map(equal, a, b))
+    if isinstance(a, float) and isinstance(b, float) and math.isnan(a):
+        return math.isnan(b)
+    return bool(a == b)
+
+
+def content_hash(a: object) -> int:
+    """A hash that agrees with `equal`.  TypeError where a field holds what has no content of its own (an open file)."""
+    if isinstance(a, np.ndarray):
+        if a.dtype.kind == "f":
+            a = np.where(np.isnan(a), np.nan, a.astype(np.float64) + 0.0)
+        digest = hashlib.blake2b(np.ascontiguousarray(a).tobytes(), digest_size=8).digest()
+        return hash((a.shape, digest))
+    if isinstance(a, Mapping):
+        return hash(frozenset((k, content_hash(v)) for k, v in a.items()))
+    if isinstance(a, (list, tuple)):
+        return hash(tuple(map(content_hash, a)))
+    if isinstance(a, float) and math.isnan(a):
+        return hash("nan")
+    return hash(a)
+
+
+def shown(a: object) -> str:
+    """A field on one line."""
+    if isinstance(a, np.ndarray) and a.size > 12:
+        text = f"array {a.shape} {a.dtype}"
+        if a.dtype.kind in "fiu" and np.isfinite(a).any():
+            finite = a[np.isfinite(a)]
+            text += f", {finite.min():.6g} to {finite.max():.6g}"
+    elif isinstance(a, np.ndarray):
+        text = " ".join(np.array2string(a, precision=6, separator=", ").split())
+    elif isinstance(a, (list, tuple)) and len(a) > 6:
+        text = f"{len(a)}: {a[0]!r}, {a[1]!r} ... {a[-1]!r}"
+    elif isinstance(a, Mapping):
+        text = "{" + ", ".join(f"{k!r}: {shown(v)}" for k, v in a.items()) + "}"
+    else:
+        text = " ".join(repr(a).split())
+    return text if len(text) <= SHOWN else text[: SHOWN - 1] + "\u2026"
+
+
+def _fields(value: object) -> list[tuple[str, object]]:
+    """Fields that are given (not None) and part of the repr."""
+    named = [(f.name, getattr(value, f.name)) for f in dataclasses.fields(value) if f.repr]  # type: ignore[arg-type]
+    return [(name, held) for name, held in named if held is not None]
+
+
+def _repr(self: object) -> str:
+    size = f" of {len(self)}" if isinstance(self, Rows) else ""
+    lines = [f"  {name} = {shown(held)}" for name, held in _fields(self)]
+    return "\n".join([f"{type(self).__name__}{size}", *lines])
+
+
+def _repr_html(self: object) -> str:
+    size = f" of {len(self)}" if isinstance(self, Rows) else ""
+    rows = "".join(
+        f"<tr><th style='text-align:left'>{html.escape(name)}</th><td style='text-align:left'>"
+        f"{html.escape(shown(held))}</td></tr>"
+        for name, held in _fields(self)
+    )
+    return f"<table><caption>{html.escape(type(self).__name__ + size)}</caption>{rows}</table>"
+
+
+def _eq(self: object, other: object) -> object:
+    if type(other) is not type(self):
+        return NotImplemented
+    return all(
+        equal(getattr(self, f.name), getattr(other, f.name))
+        for f in dataclasses.fields(self)  # type: ignore[arg-type]
+        if f.compare
+    )
+
+
+def _hash(self: object) -> int:
+    fields = [f for f in dataclasses.fields(self) if f.compare]  # type: ignore[arg-type]
+    return hash((type(self).__name__, *(content_hash(getattr(self, f.name)) for f in fields)))
+
+
+@overload
+def value(cls: type[T]) -> type[T]: ...
+@overload
+def value(*, kw_only: bool) -> Callable[[type[T]], type[T]]: ...
+@dataclass_transform(kw_only_default=True, frozen_default=True, eq_default=True, field_specifiers=(dataclasses.field,))
+def value(cls: type[T] | None = None, *, kw_only: bool = True) -> type[T] | Callable[[type[T]], type[T]]:
+    """Class decorator: a frozen, keyword-only dataclass that is compared, hashed and shown by content.
+
+    kw_only=False lets the fields be given by place too, for values whose first fields need no name.
+    """
+
+    def decorate(kind: type[T]) -> type[T]:
+        for name, method in {"__eq__": _eq, "__hash__": _hash, "__repr__": _repr, "_repr_html_": _repr_html}.items():
+            if name not in vars(kind):
+                setattr(kind, name, method)
+        return dataclasses.dataclass(frozen=True, kw_only=kw_only, eq=False, repr=False)(kind)
+
+    return decorate if cls is None else decorate(cls)
+
+
+class Rows(ABC):
+    """n rows with the names `pose_id`: what sequences of poses, observations and matrices have in common.
+
+    A number, a pose id, a slice, a mask or a list of either selects rows; the result is of the same kind, also for one
+    row.  Iteration gives the rows one by one.
+    """
+
+    pose_id: tuple[str, ...]
+
+    @abstractmethod
+    def select(self: R, index: object) -> R:
+        """The rows with those indices (or that mask or slice), in that order."""
+
+    @abstractmethod
+    def columns(self) -> dict[str, Column]:
+        """Name (with its unit) -> one entry a row."""
+
+    def __len__(self) -> int:
+        return len(self.pose_id)
+
+    def __getitem__(self: R, index: object) -> R:
+        if isinstance(index, str):
+            index = [index]
+        if isinstance(index, (int, np.integer)) and not isinstance(index, bool):
+            if not -len(self) <= index < len(self):
+                raise IndexError(f"row {index} of {len(self)}")
+            index = [int(index)]
+        if isinstance(index, (list, tuple)) and any(isinstance(i, str) for i in index):
+            return self.select(self.index_of(index))
+        return self.select(index)
+
+    def __iter__(self: R) -> Iterator[R]:
+        return (self[k] for k in range(len(self)))
+
+    def index_of(self, pose_id: Sequence[str]) -> np.ndarray:
+        """Row numbers of those ids; InputError names an id that is not here."""
+        where = {p: k for k, p in enumerate(self.pose_id)}
+        unknown = [p for p in pose_id if p not in where]
+        if unknown:
+            held = f"{len(self)} rows from {self.pose_id[0]!r} to {self.pose_id[-1]!r}" if len(self) else "no rows"
+            raise InputError(
+                f"{len(unknown)} pose ids are not in the pose table, the first is {unknown[0]!r}; "
+                f"the table holds {held}"
+            )
+        return np.array([where[p] for p in pose_id], dtype=np.intp)
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """The rows as a pandas table, indexed by pose id.  EngineMissingError where pandas is not installed."""
+        return table(self.columns(), self.pose_id, "pose_id")
+
+
+def table(columns: Mapping[str, Column], index: Sequence[str], name: str) -> pandas.DataFrame:
+    """A pandas table.  EngineMissingError where pandas is not installed."""
+    try:
+        import pandas
+    except ImportError as error:
+        raise EngineMissingError("pandas is not installed", install_line="pip install pandas") from error
+    return pandas.DataFrame(dict(columns), index=pandas.Index(index, name=name))
+
+
+def require(name: str, given: object, kind: type[T] | tuple[type[T], ...], *, made_by: str) -> T:
+    """The argument, if it is of that type.
+
+    Raises InputError that names the argument, what was given, and how one gets the right type:
+    `require("poses", poses, PoseSequence, made_by="read_poses(path) reads one")`.
+    """
+    kinds = kind if isinstance(kind, tuple) else (kind,)
+    if isinstance(given, kinds):
+        return given
+    wanted = " or ".join(k.__name__ for k in kinds)
+    article = "an" if type(given).__name__[:1].lower() in "aeiou" else "a"
+    raise InputError(f"{name} must be a {wanted}; {article} {type(given).__name__} was given: {made_by}")
