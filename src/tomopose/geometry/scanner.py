@@ -56,7 +56,8 @@ class Scanner:
                  piercing point of the paper.
     axis_y, axis_tilt_x, axis_tilt_y:  where the real table axis passes the W origin (mm along y_W) and its
                  direction R_x(axis_tilt_x) R_y(axis_tilt_y) e_z, rad; the paper takes all three as 0.
-    sigma:       prior standard deviations by parameter name, in the parameter's own unit.
+    sigma:       prior standard deviations by parameter name, in the parameter's own unit; 0 says that the value is exact.
+                 A name that is missing is not exact: a calibration assumes a documented default for it.
     image_rows:  row order of image *files*: with "top-first", file row r is v = n_v - 1 - r.
     certificate: where the numbers come from.
     """
@@ -106,14 +107,20 @@ class Scanner:
         for name, value in self.sigma.items():
             if name not in PARAMETER_UNITS:
                 raise InputError(f"scanner: sigma names {name!r}; known are {', '.join(PARAMETER_UNITS)}")
-            if not (math.isfinite(value) and value > 0):
-                raise InputError(f"scanner: sigma of {name} is {value}; a positive number is needed")
+            if not (math.isfinite(value) and value >= 0):
+                raise InputError(
+                    f"scanner: sigma of {name} is {value}; a positive number is needed, or 0 for a value that is exact"
+                )
         object.__setattr__(self, "sigma", MappingProxyType(dict(self.sigma)))
 
     def __reduce__(self) -> tuple[object, tuple[dict[str, object]]]:
         # A mapping proxy cannot be pickled, and worker processes receive scanners.
         values = {**self.__dict__, "sigma": dict(self.sigma)}
         return _scanner_from_dict, (values,)
+
+    def exact(self) -> Scanner:
+        """The same scanner with sigma 0 for every parameter that has none: known without error."""
+        return replace(self, sigma={**dict.fromkeys(PARAMETER_UNITS, 0.0), **self.sigma})
 
     @property
     def magnification(self) -> float:

@@ -108,7 +108,7 @@ def scanner_schema() -> dict[str, Any]:
             "sigma": {
                 "type": "object",
                 "additionalProperties": False,
-                "properties": {key: {"type": "number", "exclusiveMinimum": 0} for key in KEYS},
+                "properties": {key: {"type": "number", "minimum": 0} for key in KEYS},
             },
             "image_rows": {"enum": ["top-first", "bottom-first"]},
             "certificate": {"type": "string"},

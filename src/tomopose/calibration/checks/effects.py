@@ -1,0 +1,283 @@
+"""What could be so: effects on the projected centres, as columns of a linear model, and their words.
+
+All columns are whitened; a size is in the unit that the words name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+
+import numpy as np
+
+from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, ProjectionBlocks
+from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.model.unseen import turns
+from tomopose.geometry.rotations import skew
+from tomopose.units import Array
+
+DRIFT_ORDER = 3
+TILES = 4
+FEW_ANGLES, MANY_ANGLES = 3, 12
+"""Table angles that must differ before harmonics are asked for; from the second number on two harmonics are."""
+
+Words = Callable[[Array, float, str], str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effect:
+    """name: fixed;  kind: scanner | panel | manipulator | table | time | step;  short: a few words;
+    words: (size, px, pose id) -> the sentence."""
+
+    name: str
+    kind: str
+    short: str
+    words: Words
+
+    def words_of(self, size: Array, px: float, at: str, *, short: bool = False) -> str:
+        return self.short if short else f"{self.words(size, px, at)} ({px:.2g} px rms)"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Columns:
+    """C (2 n, c): whitened columns of an effect."""
+
+    effect: Effect
+    C: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steps:
+    """C (n, 2, c): whitened columns of something that may change at any pose; at least `least` poses on each side."""
+
+    effect: Effect
+    C: Array
+    least: int
+
+
+SCANNER_WORDS = {
+    "eta": ("the panel is rolled about the beam (eta) by {:+.3g} mrad", 1e3, "roll of the panel (eta)"),
+    "theta": ("the panel is tilted about its rows (theta) by {:+.3g} mrad", 1e3, "tilt theta"),
+    "phi": ("the panel is tilted about its columns (phi) by {:+.3g} mrad", 1e3, "tilt phi"),
+    "d_SD": ("d_SD is off by {:+.3g} mm", 1.0, "d_SD"),
+    "d_SR": ("d_SR is off by {:+.3g} mm", 1.0, "d_SR"),
+    "u_0": ("u_0 is off by {:+.3g} px", 1.0, "u_0"),
+    "v_0": ("v_0 is off by {:+.3g} px", 1.0, "v_0"),
+    "p_u": ("the pixel pitch p_u is off by {:+.3g} um", 1e3, "pitch p_u"),
+    "p_v": ("the pixel pitch p_v is off by {:+.3g} um", 1e3, "pitch p_v"),
+    "axis_y": ("the table axis passes W by {:+.3g} um (axis_y)", 1e3, "offset of the table axis (axis_y)"),
+    "axis_tilt_x": ("the table axis is tilted (axis_tilt_x) by {:+.3g} mrad", 1e3, "tilt of the table axis (axis_tilt_x)"),
+    "axis_tilt_y": ("the table axis is tilted (axis_tilt_y) by {:+.3g} mrad", 1e3, "tilt of the table axis (axis_tilt_y)"),
+    "translation_scale": ("the manipulator's translations have the scale 1 {:+.3g}", 1.0, "translation scale"),
+}
+
+
+def scanner_effect(name: str) -> Effect:
+    text, factor, short = SCANNER_WORDS[name]
+    kind = "manipulator" if name == "translation_scale" else "scanner"
+    return Effect(name=name, kind=kind, short=short, words=lambda size, px, at: text.format(float(size[0]) * factor))
+
+
+def _fixed(name: str, kind: str, short: str, text: str | None = None) -> Effect:
+    sentence = short if text is None else text
+    return Effect(name=name, kind=kind, short=short, words=lambda size, px, at: sentence)
+
+
+def _length(name: str, kind: str, short: str, text: str, factor: float, order: int) -> Effect:
+    """A drift: its reach is the largest distance between two moments of the run."""
+
+    def words(size: Array, px: float, at: str) -> str:
+        course = np.polynomial.legendre.legvander(np.linspace(-1, 1, 40), order)[:, 1:]
+        path = course @ size.reshape(order, -1)
+        return text.format(float(np.linalg.norm(path[:, None] - path[None], axis=2).max()) * factor)
+
+    return Effect(name=name, kind=kind, short=short, words=words)
+
+
+def elapsed(problem: Problem) -> Array:
+    """(n,) time since the first image, s; the place in the sequence where no times are known."""
+    if problem.time_utc is not None:
+        try:
+            t = np.array([datetime.fromisoformat(s).timestamp() for s in problem.time_utc])
+        except ValueError:
+            t = np.zeros(0)
+        if t.size and np.ptp(t) > 0:
+            return np.asarray(t - t.min())
+    return np.arange(len(problem), dtype=np.float64)
+
+
+def _white(problem: Problem, C: Array) -> Array:
+    return np.asarray((problem.W @ C).reshape(2 * len(problem), -1))
+
+
+def effects_of(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
+    """All effects without a place: scanner, panel, manipulator, table, time."""
+    n = len(problem)
+    found = [
+        Columns(effect=scanner_effect(name), C=_white(problem, b.J_scanner[:, :, [k]]))
+        for k, name in enumerate(SCANNER_COLUMNS)
+    ]
+    found += _panel(problem, b)
+    found += _manipulator(problem, b)
+    found += _table(problem, b)
+    if n > 2 * DRIFT_ORDER:
+        found += _drifts(problem, b)
+    return found
+
+
+def _panel(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
+    s = problem.scanner
+    size = np.array([s.n_u, s.n_v], dtype=np.float64)
+    middle = (size - 1) / 2
+    q = (b.x_D - middle) / np.linalg.norm(middle)
+    radial = q * (q * q).sum(axis=1, keepdims=True)
+    found = [
+        Columns(
+            effect=Effect(
+                name="radial distortion",
+                kind="panel",
+                short="radial distortion of the panel",
+                words=lambda size, px, at: f"the panel shows a radial distortion of {float(size[0]):+.2g} px at its corners",
+            ),
+            C=_white(problem, radial[:, :, None]),
+        )
+    ]
+    cell = np.clip((b.x_D / size * TILES).astype(int), 0, TILES - 1) @ [1, TILES]
+    hit = [k for k in np.unique(cell) if (cell == k).sum() >= 4]
+    if len(hit) > 2:
+        tiles = np.zeros((len(problem), 2, 2 * len(hit)))
+        for j, k in enumerate(hit):
+            tiles[cell == k, 0, 2 * j] = tiles[cell == k, 1, 2 * j + 1] = 1.0
+        found.append(
+            Columns(
+                effect=_fixed(
+                    "tile map", "panel", "displaced tiles of the panel", "the panel's parts (tiles) are displaced"
+                ),
+                C=_white(problem, tiles),
+            )
+        )
+    return found
+
+
+def rotation_scale_columns(b: ProjectionBlocks, origin: Array) -> Array:
+    """(n, 2, 3) px: by the scale errors of the rotations about x, y, z.  origin (n, 3): the plate's origin in H."""
+    w = turns(b.R_MH)
+    by_turn = -b.G_H @ skew(b.x_H - origin)
+    return by_turn * w[:, None, :]
+
+
+def _manipulator(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
+    t = problem.t_MH
+    found = [
+        Columns(
+            effect=Effect(
+                name=f"scale of {c}",
+                kind="manipulator",
+                short=f"translation scale of {c}",
+                words=lambda size, px, at, c=c: f"the manipulator's {c} has the translation scale 1 {float(size[0]):+.2g}",
+            ),
+            C=_white(problem, (b.G_H[:, :, i] * t[:, i, None])[:, :, None]),
+        )
+        for i, c in enumerate("xyz")
+    ]
+    square = np.stack([b.G_H[:, :, i] * t[:, j, None] for i in range(3) for j in range(3) if i != j], axis=2)
+    found.append(
+        Columns(
+            effect=_fixed("axes", "manipulator", "axes of the manipulator not square or not parallel"),
+            C=_white(problem, square),
+        )
+    )
+    scale = rotation_scale_columns(b, t)
+    found.append(
+        Columns(
+            effect=Effect(
+                name="rotation scale",
+                kind="manipulator",
+                short="rotation scale",
+                words=lambda size, px, at: "the manipulator's rotation scale is 1 "
+                + ", ".join(f"{float(s):+.2g}" for s in size)
+                + " about x, y, z",
+            ),
+            C=_white(problem, scale),
+        )
+    )
+    return found
+
+
+def _table(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
+    """Errors of the table's angle and axis, by harmonics of it; by the angle where few of them differ."""
+    alpha = problem.alpha
+    angles, which = np.unique(np.round(alpha, 9), return_inverse=True)
+    if len(angles) < 2:
+        return []
+    # dx_T by a turn about the axis, as the images see it: R_z x_T moves along e_z x x_T
+    y_T = np.einsum("nij,nj->ni", _mount(b), b.x_H)
+    by_angle = (b.J_t_HT @ np.cross([0.0, 0.0, 1.0], y_T)[:, :, None])[..., 0]
+    if len(angles) > FEW_ANGLES:
+        orders = (1, 2) if len(angles) >= MANY_ANGLES else (1,)
+        waves = np.column_stack([f(k * alpha) for k in orders for f in (np.sin, np.cos)])
+    else:
+        waves = np.eye(len(angles))[which][:, 1:]
+    turn = by_angle[:, :, None] * waves[:, None, :]
+    found = [
+        Columns(effect=_fixed("table angle", "table", "errors of the table's angle"), C=_white(problem, turn))
+    ]
+    if len(angles) > FEW_ANGLES:
+        G = b.J_t_HT
+        shift = (G[:, :, :, None] * waves[:, None, None, :]).reshape(len(alpha), 2, -1)
+        found.append(Columns(effect=_fixed("table wobble", "table", "wobble of the table"), C=_white(problem, shift)))
+    return found
+
+
+def _mount(b: ProjectionBlocks) -> Array:
+    """(n, 3, 3) R_HT, from dx/dx_H = dx/dx_T R_HT and dx/dw_HT; the same for all poses."""
+    A = b.J_t_HT.reshape(-1, 3)
+    R = np.linalg.lstsq(A, b.G_H.reshape(-1, 3), rcond=None)[0]
+    return np.broadcast_to(R, (len(b.x_H), 3, 3))
+
+
+def _drifts(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
+    tau = elapsed(problem)
+    course = np.polynomial.legendre.legvander(2.0 * tau / np.ptp(tau) - 1.0, DRIFT_ORDER)[:, 1:]
+    found = []
+    image = np.broadcast_to(np.eye(2), (len(problem), 2, 2))
+    for order, ending in ((1, "linear"), (DRIFT_ORDER, "curved")):
+        for name, short, text, factor, base in (
+            ("image drift", "drift of the focal spot or the images", "the images drift by {:.2g} px over the run (focal spot or detector)", 1.0, image),
+            ("ball drift", "drift of the ball", "the ball drifts by {:.2g} um over the run", 1000.0, b.J_t_HT),
+        ):
+            C = (base[:, :, None, :] * course[:, None, :order, None]).reshape(len(problem), 2, -1)
+            effect = _length(name if order > 1 else f"{name}, {ending}", "time", short, text, factor, order)
+            found.append(Columns(effect=effect, C=_white(problem, C)))
+    return found
+
+
+def _step_effect(name: str, short: str, text: str, part: slice, factor: float, unit: str) -> Effect:
+    def words(size: Array, px: float, at: str) -> str:
+        return f"{text} at pose {at}, by {np.linalg.norm(size[part]) * factor:.2g} {unit}"
+
+    return Effect(name=name, kind="step", short=short, words=words)
+
+
+def steps_of(problem: Problem, b: ProjectionBlocks) -> list[Steps]:
+    """What may change from one pose to the next: the ball, the mount, the images."""
+    n, balls = len(problem), len(problem.ball_ids)
+    J_mount = problem.W @ b.J_mount
+    return [
+        Steps(
+            effect=_step_effect("ball step", "the ball slipped", "the ball changed its place (slipped)", slice(0, 3), 1000.0, "um"),
+            C=problem.W @ b.J_t,
+            least=2,
+        ),
+        Steps(
+            effect=_step_effect("mount step", "the mount moved", "the mount changed (bumped or referenced anew)", slice(3, 6), 1000.0, "um"),
+            C=J_mount,
+            least=3,
+        ),
+        Steps(
+            effect=_step_effect("image step", "the images jumped", "the images jumped (focal spot or detector)", slice(0, 2), 1.0, "px"),
+            C=np.array(np.broadcast_to(problem.W @ np.eye(2), (n, 2, 2))),
+            least=2,
+        ),
+    ][: 3 if balls else 3]

@@ -1,0 +1,96 @@
+r"""What a ball cannot see of table and manipulator, but a scan can: directions with a prior and no data.
+
+A scale error of the rotations turns the object too far, and moves a ball as a longer lever would: the fit takes it for
+another t.  A table that wobbles moves nothing while it stands still.  With x = f(theta) + C q + noise, q the errors with
+standard deviations sigma, the estimate is off by K q, K = (J^T V^-1 J + P^-1)^-1 J^T V^-1 C, and a scan whose pixels
+change by J_s and S is off by (J_s K - S) q: the "consider" covariance of orbit determination (Schmidt, Adv. Control
+Systems 3 (1966) 293).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tomopose.calibration.model.assumed import ROTATION_SCALE, WOBBLE_MM, WOBBLE_RAD
+from tomopose.calibration.model.ball_projection import ProjectionBlocks
+from tomopose.geometry.rotations import R_z, log_rotation, skew
+from tomopose.geometry.transforms import RigidTransform
+from tomopose.units import Array
+
+HARMONICS = (1, 2)
+PLATFORM_RAD = 0.6
+"""A manipulator that turns further than this between its poses is no platform: a robot's angles are joint encoders, and
+its errors those of its links, so that the scale of its rotations is not assumed."""
+
+ROTATIONS = tuple(f"rotation_scale_{c}" for c in "xyz")
+WOBBLES = (
+    *(f"table_{c}_{f}{k}" for k in HARMONICS for c in "xyz" for f in ("cos", "sin")),
+    *(f"table_tilt_{c}_{f}{k}" for k in HARMONICS for c in "xy" for f in ("cos", "sin")),
+)
+NAMES = (*ROTATIONS, *WOBBLES)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unseen:
+    """names (c), sigma (c,): priors (1, mm, rad);  gain (m, c): K, how the estimate answers to each."""
+
+    names: tuple[str, ...]
+    sigma: Array
+    gain: Array
+
+
+def unseen_sigma(names: tuple[str, ...]) -> Array:
+    """Prior standard deviations; the second harmonic of a wobble is half the first."""
+    values = []
+    for name in names:
+        size = ROTATION_SCALE if name in ROTATIONS else WOBBLE_RAD if name.startswith("table_tilt") else WOBBLE_MM
+        values.append(size / (int(name[-1]) if name in WOBBLES else 1))
+    return np.array(values)
+
+
+def unseen_names(R_MH: Array, *, table: bool) -> tuple[str, ...]:
+    """Those that apply to a manipulator with poses R_MH (n, 3, 3), and to a set-up with or without a table."""
+    turned = np.linalg.norm(log_rotation(R_MH[0].T @ R_MH), axis=1).max()
+    return (*(ROTATIONS if 0.0 < turned < PLATFORM_RAD else ()), *(WOBBLES if table else ()))
+
+
+def turns(R: Array) -> Array:
+    """(n, 3) rotation vectors of poses, limited to half a radian: what a scale error multiplies."""
+    w = log_rotation(R)
+    size = np.linalg.norm(w, axis=1, keepdims=True)
+    return np.asarray(w * np.minimum(1.0, 0.5 / np.maximum(size, 1e-300)))
+
+
+def unseen_columns(
+    names: tuple[str, ...], b: ProjectionBlocks, *, T_HT: RigidTransform, origin: Array, alpha: Array
+) -> Array:
+    """(n, 2, c) px by a unit of each: of the balls or points that `b` projects.
+
+    origin (n, 3): the plate's origin in H, mm;  alpha (n,): table angle, rad.
+    """
+    M = R_z(alpha)
+    G_W = b.J_t_HT @ np.swapaxes(M, 1, 2)
+    x_W = np.einsum("nij,nj->ni", M, b.x_H @ T_HT.R.T + T_HT.t)
+    by_turn = -b.G_H @ skew(b.x_H - origin)
+    by_tilt = -G_W @ skew(x_W)
+    w = turns(b.R_MH)
+    columns = []
+    for name in names:
+        if name in ROTATIONS:
+            i = "xyz".index(name[-1])
+            columns.append(by_turn[:, :, i] * w[:, None, i])
+            continue
+        wave = (np.cos if name[-4:-1] == "cos" else np.sin)(int(name[-1]) * alpha)[:, None]
+        axis = "xyz".index(name.split("_")[-2])
+        columns.append((by_tilt if name.startswith("table_tilt") else G_W)[:, :, axis] * wave)
+    return np.stack(columns, axis=2) if columns else np.zeros((*b.x_D.shape, 0))
+
+
+def unseen_gain(names: tuple[str, ...], covariance: Array, J: Array, V: Array, C: Array) -> Unseen:
+    """K from the estimate's covariance (m, m), Jacobian J (n, 2, m), covariances V (n, 2, 2) of the centres and columns
+    C (n, 2, c)."""
+    weighted = np.linalg.solve(V, C)
+    gain = covariance @ np.einsum("nim,nic->mc", J, weighted)
+    return Unseen(names=names, sigma=unseen_sigma(names), gain=gain)
