@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from chain import World
-from plans import Poses
 
 DEG = np.pi / 180
 
@@ -113,7 +112,9 @@ def _sign(d: Data, rng, v) -> None:
 
 TABLE = ("hexapod",)
 BENDS: list[Bend] = [
-    *panel("roll", "eta", [("0.02 deg", 0.02 * DEG), ("0.05 deg", 0.05 * DEG), ("0.2 deg", 0.2 * DEG)], ("eta", "roll")),
+    *panel(
+        "roll", "eta", [("0.02 deg", 0.02 * DEG), ("0.05 deg", 0.05 * DEG), ("0.2 deg", 0.2 * DEG)], ("eta", "roll")
+    ),
     *panel("tilt theta", "theta", [("0.05 deg", 0.05 * DEG), ("0.3 deg", 0.3 * DEG)], ("theta", "tilt")),
     *panel("tilt phi", "phi", [("0.05 deg", 0.05 * DEG), ("0.3 deg", 0.3 * DEG)], ("phi", "tilt")),
     *panel("d_SD", "d_SD", [("0.5 mm", 0.5), ("3 mm", 3.0)], ("d_SD", "pitch", "p_u", "p_v")),
@@ -124,37 +125,99 @@ BENDS: list[Bend] = [
     *_world("both pitches", ("pitch", "p_u", "p_v", "d_SD"), [("5e-4", 5e-4)], _both_pitches),
     *_world("barrel", ("distortion",), [("0.1 px", 0.1), ("0.5 px", 0.5)], _set("panel", "barrel")),
     *_world("tiles", ("tile",), [("0.05 px", 0.05), ("0.3 px", 0.3)], _tiles),
-    *_world("axis offset", ("u_0", "axis", "phi"), [("0.05 mm", 0.05), ("0.3 mm", 0.3)],
-            lambda w, rng, n, v: setattr(w.table, "offset", np.array([0.0, v, 0.0])), where=TABLE),
-    *_world("axis lean", ("axis", "eta", "roll", "theta", "tilt", "v_0"), [("0.3 mrad", 3e-4), ("2 mrad", 2e-3)],
-            lambda w, rng, n, v: setattr(w.table, "lean", (v, -v / 2)), where=TABLE),
-    *_world("table wobble", ("table", "wobble"), [("0.3 um 1 urad", (3e-4, 1e-6)), ("3 um 20 urad", (3e-3, 2e-5))],
-            _wobble, where=TABLE),
-    *_world("table encoder", ("table",), [("20 urad", 2e-5), ("200 urad", 2e-4)],
-            lambda w, rng, n, v: w.table.encoder.append((2, v, rng.uniform(0, 6))), where=TABLE),
-    *_world("translation scale", ("translation", "scale", "d_SR", "d_SD"), [("2e-4", 2e-4), ("2e-3", 2e-3)],
-            lambda w, rng, n, v: setattr(w.machine, "scale_t", 1 + v * np.ones(3))),
-    *_world("travel of z", ("translation", "scale", "p_v"), [("5e-4", 5e-4)],
-            lambda w, rng, n, v: setattr(w.machine, "scale_t", np.array([1, 1, 1 + v]))),
-    *_world("rotation scale", ("rotation", "scale"), [("2e-4", 2e-4), ("3e-3", 3e-3)],
-            lambda w, rng, n, v: setattr(w.machine, "scale_w", 1 + v * np.ones(3))),
-    *_world("squareness", ("manipulator", "axes", "scale", "eta", "roll"), [("50 urad", 5e-5), ("1 mrad", 1e-3)],
-            lambda w, rng, n, v: setattr(w.machine, "skew", v * np.triu(rng.choice([-1, 1], (3, 3)), 1))),
-    *_world("backlash", (), [("0.5 um 5 urad", (5e-4, 5e-6)), ("10 um 50 urad", (1e-2, 5e-5))],
-            lambda w, rng, n, v: setattr(w.machine, "backlash", np.repeat(v, 3))),
-    *_world("periodic", (), [("0.5 um", (5e-4, 5e-6)), ("5 um", (5e-3, 5e-5))],
-            lambda w, rng, n, v: setattr(w.machine, "periodic",
-                                         [(k, v[k // 3], 3.1 if k < 3 else 0.03, rng.uniform(0, 6)) for k in range(6)])),
-    *_world("scatter", (), [("0.5 um 12 urad", (5e-4, 12e-6)), ("3 um 40 urad", (3e-3, 4e-5))],
-            _set("machine", "scatter")),
-    *_world("spot drift", ("spot", "image", "drift"), [("1 um", 1e-3), ("20 um", 2e-2)],
-            lambda w, rng, n, v: setattr(w, "spot_drift", v * np.array([0.8, 0.6, 0.0]))),
-    *_world("image drift", ("spot", "image", "drift"), [("0.05 px", 0.05), ("0.5 px", 0.5)],
-            lambda w, rng, n, v: setattr(w, "image_drift", v * _unit(rng, 2))),
-    *_world("ball drift", ("drift",), [("2 um", 2e-3), ("20 um", 2e-2)],
-            lambda w, rng, n, v: setattr(w, "ball_drift", v * _unit(rng))),
-    *_world("slip", ("ball", "slip"), [("3 um", 3e-3), ("30 um", 3e-2)],
-            lambda w, rng, n, v: setattr(w, "slip", (int(0.6 * n), v * _unit(rng)))),
+    *_world(
+        "axis offset",
+        ("u_0", "axis", "phi"),
+        [("0.05 mm", 0.05), ("0.3 mm", 0.3)],
+        lambda w, rng, n, v: setattr(w.table, "offset", np.array([0.0, v, 0.0])),
+        where=TABLE,
+    ),
+    *_world(
+        "axis lean",
+        ("axis", "eta", "roll", "theta", "tilt", "v_0"),
+        [("0.3 mrad", 3e-4), ("2 mrad", 2e-3)],
+        lambda w, rng, n, v: setattr(w.table, "lean", (v, -v / 2)),
+        where=TABLE,
+    ),
+    *_world(
+        "table wobble",
+        ("table", "wobble"),
+        [("0.3 um 1 urad", (3e-4, 1e-6)), ("3 um 20 urad", (3e-3, 2e-5))],
+        _wobble,
+        where=TABLE,
+    ),
+    *_world(
+        "table encoder",
+        ("table",),
+        [("20 urad", 2e-5), ("200 urad", 2e-4)],
+        lambda w, rng, n, v: w.table.encoder.append((2, v, rng.uniform(0, 6))),
+        where=TABLE,
+    ),
+    *_world(
+        "translation scale",
+        ("translation", "scale", "d_SR", "d_SD"),
+        [("2e-4", 2e-4), ("2e-3", 2e-3)],
+        lambda w, rng, n, v: setattr(w.machine, "scale_t", 1 + v * np.ones(3)),
+    ),
+    *_world(
+        "travel of z",
+        ("translation", "scale", "p_v"),
+        [("5e-4", 5e-4)],
+        lambda w, rng, n, v: setattr(w.machine, "scale_t", np.array([1, 1, 1 + v])),
+    ),
+    *_world(
+        "rotation scale",
+        ("rotation", "scale"),
+        [("2e-4", 2e-4), ("3e-3", 3e-3)],
+        lambda w, rng, n, v: setattr(w.machine, "scale_w", 1 + v * np.ones(3)),
+    ),
+    *_world(
+        "squareness",
+        ("manipulator", "axes", "scale", "eta", "roll"),
+        [("50 urad", 5e-5), ("1 mrad", 1e-3)],
+        lambda w, rng, n, v: setattr(w.machine, "skew", v * np.triu(rng.choice([-1, 1], (3, 3)), 1)),
+    ),
+    *_world(
+        "backlash",
+        (),
+        [("0.5 um 5 urad", (5e-4, 5e-6)), ("10 um 50 urad", (1e-2, 5e-5))],
+        lambda w, rng, n, v: setattr(w.machine, "backlash", np.repeat(v, 3)),
+    ),
+    *_world(
+        "periodic",
+        (),
+        [("0.5 um", (5e-4, 5e-6)), ("5 um", (5e-3, 5e-5))],
+        lambda w, rng, n, v: setattr(
+            w.machine, "periodic", [(k, v[k // 3], 3.1 if k < 3 else 0.03, rng.uniform(0, 6)) for k in range(6)]
+        ),
+    ),
+    *_world(
+        "scatter", (), [("0.5 um 12 urad", (5e-4, 12e-6)), ("3 um 40 urad", (3e-3, 4e-5))], _set("machine", "scatter")
+    ),
+    *_world(
+        "spot drift",
+        ("spot", "image", "drift"),
+        [("1 um", 1e-3), ("20 um", 2e-2)],
+        lambda w, rng, n, v: setattr(w, "spot_drift", v * np.array([0.8, 0.6, 0.0])),
+    ),
+    *_world(
+        "image drift",
+        ("spot", "image", "drift"),
+        [("0.05 px", 0.05), ("0.5 px", 0.5)],
+        lambda w, rng, n, v: setattr(w, "image_drift", v * _unit(rng, 2)),
+    ),
+    *_world(
+        "ball drift",
+        ("drift",),
+        [("2 um", 2e-3), ("20 um", 2e-2)],
+        lambda w, rng, n, v: setattr(w, "ball_drift", v * _unit(rng)),
+    ),
+    *_world(
+        "slip",
+        ("ball", "slip"),
+        [("3 um", 3e-3), ("30 um", 3e-2)],
+        lambda w, rng, n, v: setattr(w, "slip", (int(0.6 * n), v * _unit(rng))),
+    ),
     *_world("bump at 40 %", ("mount", "step"), [("5 um", 5e-3), ("100 um", 0.1)], _bump(0.4)),
     *_world("bump at 93 %", ("mount", "step", "moved"), [("20 um", 2e-2), ("100 um", 0.1)], _bump(0.93)),
     *_world("bump before the last 4", ("mount", "step", "moved", "ball"), [("20 um", 2e-2), ("100 um", 0.1)], _bump(4)),

@@ -169,7 +169,7 @@ class World:
         *,
         run: bool,
     ) -> np.ndarray:
-        """(n, m, 2) px of points x_M (n, m, 3).  run: what happens in time happens (in a scan it does not, or is over)."""
+        """(n, m, 2) px of points x_M (n, m, 3).  run: what happens in time happens; a scan comes after it."""
         n = len(w)
         R, s = self.machine.real(w, t, intrinsic_xyz, rng)
         x_M = np.array(np.broadcast_to(x_M, (n, *np.shape(x_M)[-2:])), dtype=float)

@@ -1,4 +1,4 @@
-"""Calibration plans and scans of the benchmark: what is commanded, as plain angles (rad), positions (mm), table (rad)."""
+"""Calibration plans and scans of the benchmark: what is commanded, as angles (rad), positions (mm), table (rad)."""
 
 from __future__ import annotations
 

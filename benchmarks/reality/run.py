@@ -1,4 +1,4 @@
-"""Where the uncertainty holds and where it does not.  python benchmarks/reality/run.py [--quick] [--only WORDS] [--list]
+"""Where the uncertainty holds and where it does not.  python benchmarks/reality/run.py [--quick] [--only W] [--list]
 
 Bends reality in known ways (bends.py) over three plans and several arrangements, calibrates, and compares the true
 error of a scan, as a volume sees it, with what the calibration states.  The truth comes from chain.py, which shares
@@ -24,7 +24,17 @@ import tomopose as tp
 NOISE = 0.0146
 FLOOR = 0.002
 """px: below it a true error is noise of the benchmark, whatever its ratio to the stated one."""
-SIZES = {"d_SD": 0.5, "d_SR": 0.1, "u_0": 1.0, "v_0": 1.0, "eta": 1e-3, "theta": 1e-3, "phi": 1e-3, "p_u": 2e-5, "p_v": 2e-5}
+SIZES = {
+    "d_SD": 0.5,
+    "d_SR": 0.1,
+    "u_0": 1.0,
+    "v_0": 1.0,
+    "eta": 1e-3,
+    "theta": 1e-3,
+    "phi": 1e-3,
+    "p_u": 2e-5,
+    "p_v": 2e-5,
+}
 
 
 @dataclass
@@ -101,8 +111,20 @@ def one(plan: str, where: str, bend: Bend | None, seed: int, *, sigma: dict[str,
     cal, words = _calibrate(where, scanner, logged, observed)
     ms = 1000 * (time.process_time() - begin)
     if cal is None:
-        return Outcome(plan, where, bend.name if bend else "clean", bend.size if bend else "", "refused", np.nan, np.nan,
-                       np.nan, None, words, ms, {})
+        return Outcome(
+            plan,
+            where,
+            bend.name if bend else "clean",
+            bend.size if bend else "",
+            "refused",
+            np.nan,
+            np.nan,
+            np.nan,
+            None,
+            words,
+            ms,
+            {},
+        )
     x_W = plans.points_in_view(world.panel)
     x_M = (x_W - world.t_HT) @ world.R_HT
     target = world.image(scan.w, scan.t, scan.alpha, x_M, rng, run=False)
@@ -115,8 +137,20 @@ def one(plan: str, where: str, bend: Bend | None, seed: int, *, sigma: dict[str,
     named = None if bend is None or not bend.names else any(w in first for w in bend.names)
     truth = {"t_HT_x": world.t_HT[0], "t_HT_y": world.t_HT[1], "t_HT_z": world.t_HT[2]}
     shift = {p.name: (p.value - truth[p.name]) / p.u for p in cal.parameters if p.name in truth and p.u > 0}
-    return Outcome(plan, where, bend.name if bend else "clean", bend.size if bend else "", cal.verdict, true, stated,
-                   shared, named, first, ms, shift)
+    return Outcome(
+        plan,
+        where,
+        bend.name if bend else "clean",
+        bend.size if bend else "",
+        cal.verdict,
+        true,
+        stated,
+        shared,
+        named,
+        first,
+        ms,
+        shift,
+    )
 
 
 def assumed_sizes(scanner: tp.Scanner) -> dict[str, float]:
@@ -151,7 +185,9 @@ def cases(quick: bool) -> list[tuple[str, str, Bend]]:
 
 def table(outcomes: list[Outcome], title: str) -> None:
     print(f"\n{title}")
-    print(f"{'bend':24s} {'size':16s} {'runs':>4s} {'trust':>5s} {'> 3 s':>5s} {'worst':>7s} {'true px':>9s} {'named':>6s}")
+    print(
+        f"{'bend':21s} {'size':16s} {'runs':>4s} {'trust':>5s} {'> 3 s':>5s} {'worst':>7s} {'true':>8s} {'named':>6s}"
+    )
     groups: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
     for o in outcomes:
         groups[o.bend, o.size].append(o)
@@ -162,7 +198,9 @@ def table(outcomes: list[Outcome], title: str) -> None:
         named = [o.named for o in group if o.named is not None]
         share = f"{sum(named)}/{len(named)}" if named else "-"
         true = np.nanmedian([o.true for o in group])
-        print(f"{bend:24s} {size:16s} {len(group):4d} {len(trusted):5d} {len(bad):5d} {worst:7.2f} {true:9.4f} {share:>6s}")
+        print(
+            f"{bend:21s} {size:16s} {len(group):4d} {len(trusted):5d} {len(bad):5d} {worst:7.2f} {true:8.4f} {share:>6s}"
+        )
 
 
 def summary(bent: list[Outcome], clean: list[Outcome], drawn: list[Outcome]) -> dict[str, float]:
@@ -212,8 +250,10 @@ def main() -> None:
         drawn = [one(p, w, None, 2000 + k, sigma={}, draw=True) for p, w in groups for k in range(repeats)]
     if given.list:
         for o in bent + clean + drawn:
-            print(f"{o.plan:11s} {o.where:8s} {o.bend:24s} {o.size:16s} {o.verdict:12s} true {o.true:8.4f} stated "
-                  f"{o.stated:8.4f} shared {o.shared:8.4f} {o.named!s:6s} {o.ms:6.0f} ms  {o.first[:110]}")
+            print(
+                f"{o.plan:11s} {o.where:8s} {o.bend:24s} {o.size:16s} {o.verdict:12s} true {o.true:8.4f} stated "
+                f"{o.stated:8.4f} shared {o.shared:8.4f} {o.named!s:6s} {o.ms:6.0f} ms  {o.first[:110]}"
+            )
     table(bent, "Bent reality")
     figures = summary(bent, clean, drawn)
     print()

@@ -39,7 +39,7 @@ def test_matrices_mean_the_same_by_hand_and_through_a_file(tmp_path, capsys):
 
 
 def test_from_radiographs_to_geometry_files(tmp_path, capsys):
-    setup = demo_setup(grid=2, small=True, views=36)
+    setup = demo_setup(small=True, views=36)
     run = tp.simulate_ball_run(
         setup.scanner,
         T_HT=setup.T_HT,

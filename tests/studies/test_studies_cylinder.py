@@ -17,7 +17,7 @@ SCANNER = Scanner(d_SD=1200.0, d_SR=310.0, p_u=2.0, p_v=2.5, u_0=75.0, v_0=41.0,
 
 def test_the_central_ray_crosses_the_diameter():
     scan = circular_scan(3)
-    P = eq5_matrices(SCANNER, T_HT=demo_setup().T_HT, T_MH=scan.T_MH, alpha=scan.alpha)
+    P = eq5_matrices(SCANNER, T_HT=demo_setup(paper=True).T_HT, T_MH=scan.T_MH, alpha=scan.alpha)
     for view in P:
         image = cylinder.cylinder_integrals(view, SCANNER)
         assert image[41, 75] == pytest.approx(2 * cylinder.RADIUS * cylinder.ATTENUATION, rel=1e-12)

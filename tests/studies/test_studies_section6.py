@@ -47,7 +47,7 @@ TINY = Numbers(
 
 def views(n: int = 3) -> np.ndarray:
     scan = tilted_scan(n, eq11_triangle)
-    return eq5_matrices(SCANNER, T_HT=demo_setup().T_HT, T_MH=scan.T_MH, alpha=scan.alpha)
+    return eq5_matrices(SCANNER, T_HT=demo_setup(paper=True).T_HT, T_MH=scan.T_MH, alpha=scan.alpha)
 
 
 def rays(P: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -23,7 +23,9 @@ def demo(
     out: Annotated[Path, typer.Option("--out", help="Folder for everything that the demo makes.")] = Path(
         "tomopose-demo"
     ),
-    paper: Annotated[bool, typer.Option("--paper", help="The paper's full plan: 189 poses instead of 56.")] = False,
+    paper: Annotated[
+        bool, typer.Option("--paper", help="The paper's own plan: 189 poses, table still, instead of 57.")
+    ] = False,
     small: Annotated[bool, typer.Option("--small", help="A detector binned 4 x 4, for a quick look.")] = False,
     workers: Annotated[int, typer.Option("--workers", min=1, help="Processes to use.")] = os.cpu_count() or 1,
     force: ForceOption = False,
@@ -46,7 +48,7 @@ def demo(
     say = Say(json=as_json, quiet=quiet)
     for name in ("calibration.json", "scan.csv", "matrices.npz", "scanner.json"):
         require_absent(out / name, force=force)
-    setup = demo_setup(grid=3 if paper else 2, small=small)
+    setup = demo_setup(paper=paper, small=small)
     run = tp.simulate_ball_run(
         setup.scanner,
         T_HT=setup.T_HT,

@@ -1,4 +1,4 @@
-"""`tomopose plan poses`: the paper's grid, or the best poses for a scan, with the machine's own command lists."""
+"""`tomopose plan poses`: a grid or the best poses for a scan, with the machine's own command lists."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from tomopose.planning.identified_design import KinematicPlan as IdentifiedPlan
     from tomopose.planning.limits import PlanLimits
 
-EPILOG = "Example: tomopose plan poses --scanner scanner.json --optimal --table-angles-deg 0,90 --out poses.csv"
+EPILOG = "Example: tomopose plan poses --scanner scanner.json --optimal --out poses.csv"
+
+DEFAULT_ANGLES = (0.0, 90.0)
 
 KINEMATIC_IMAGES = 100
 """Images of a kinematic plan unless given."""
@@ -59,9 +61,16 @@ class Options(WritingOptions):
     spin: Annotated[
         float, typer.Option("--spin-deg", help="With --for kinematic: a robot's largest turn about its tool's z, deg.")
     ] = 165.0
+    paper: Annotated[
+        bool, typer.Option("--paper", help="The paper's own plan: turns about single axes, table at 0.")
+    ] = False
     table_angles: Annotated[
-        str, typer.Option("--table-angles-deg", help="Table angles to use; 0,90 shows what 0 alone cannot.")
-    ] = "0"
+        str | None,
+        typer.Option(
+            "--table-angles-deg",
+            help="Table angles; the whole grid is repeated at each. Without it each position is taken at 0 or 90.",
+        ),
+    ] = None
     scanner: Annotated[
         Path | None, typer.Option("--scanner", help="scanner.json; refuses poses that put the ball out of view.")
     ] = None
@@ -73,7 +82,9 @@ class Options(WritingOptions):
 
     @property
     def angles(self) -> tuple[float, ...]:
-        """Table angles, deg."""
+        """Table angles, deg: those given, or the paper's one, or two, which show what one alone cannot."""
+        if self.table_angles is None:
+            return (0.0,) if self.paper else DEFAULT_ANGLES
         return numbers(self.table_angles, "--table-angles-deg")
 
 
@@ -206,28 +217,41 @@ OPTIMAL = {"rigid": planned_for_mount, "kinematic": planned_to_identify}
 def planned(o: Options, scanner: Scanner | None) -> Planned:
     """The poses that the options ask for."""
     import tomopose as tp
+    from tomopose.trajectory.pose_grid import calibration_grid, compound_orientations
 
+    if o.paper and (o.optimal or o.table_angles is not None):
+        other = "--optimal" if o.optimal else "--table-angles-deg"
+        raise typer.BadParameter(
+            f"the paper's plan is a grid with the table at 0; leave out {other}", param_hint="--paper"
+        )
     if o.optimal:
         if scanner is None:
             raise typer.BadParameter("an optimal plan needs the scanner", param_hint="--scanner")
         if o.purpose not in OPTIMAL:
             raise typer.BadParameter(f"{o.purpose!r} is neither rigid nor kinematic", param_hint="--for")
         return OPTIMAL[o.purpose](o, scanner)
-    sequence = tp.pose_grid(
-        o.grid,
-        half_range=o.half_range,
-        tilt=math.radians(o.tilt),
-        table_angles=[math.radians(a) for a in o.angles],
-    )
+    given: dict[str, Any] = {
+        "half_range": o.half_range,
+        "tilt": math.radians(o.tilt),
+        "table_angles": [math.radians(a) for a in o.angles],
+    }
+    if o.paper:
+        sequence = tp.pose_grid(o.grid, **given)
+    elif o.table_angles is None:
+        sequence = calibration_grid(o.grid, **given)
+    else:
+        sequence = tp.pose_grid(o.grid, orientations=compound_orientations(given.pop("tilt")), **given)
     if scanner is not None:
         require_ball_in_view(scanner, sequence, o.ball_diameter)
     return Planned(poses=sequence)
 
 
 def poses(options: Options) -> int:
-    """Write calibration poses: the paper's grid n x n x n x 7 (fig. 5), or an optimal plan with its predicted error.
+    """Write calibration poses: a grid n x n x n x 7, or an optimal plan with its predicted error.
 
-    An optimal plan says what uncertainty to expect before a single image is taken, and which mistakes it would show.
+    The grid turns the plate about all axes together and the table to two angles, and takes the first pose again at the
+    end, so that the images determine the scanner's own values too and show a wrong convention; --paper writes the
+    paper's (fig. 5), which shows neither.  An optimal plan says what uncertainty to expect before an image is taken.
     """
     import tomopose as tp
     from tomopose.files import require_absent, write_text

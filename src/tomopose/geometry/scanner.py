@@ -56,7 +56,7 @@ class Scanner:
                  piercing point of the paper.
     axis_y, axis_tilt_x, axis_tilt_y:  where the real table axis passes the W origin (mm along y_W) and its
                  direction R_x(axis_tilt_x) R_y(axis_tilt_y) e_z, rad; the paper takes all three as 0.
-    sigma:       prior standard deviations by parameter name, in the parameter's own unit; 0 says that the value is exact.
+    sigma:       prior standard deviations by parameter name, in the parameter's own unit; 0: the value is exact.
                  A name that is missing is not exact: a calibration assumes a documented default for it.
     image_rows:  row order of image *files*: with "top-first", file row r is v = n_v - 1 - r.
     certificate: where the numbers come from.

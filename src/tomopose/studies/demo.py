@@ -45,12 +45,12 @@ def paper_scanner(magnification: float = 5.3) -> Scanner:
     return Scanner(d_SD=d_SD, d_SR=d_SD * voxel / (2 * p), p_u=p, p_v=p, u_0=1021.37, v_0=1026.81, n_u=2048, n_v=2048)
 
 
-def demo_setup(*, grid: int = 2, views: int = 180, small: bool = False) -> DemoSetup:
-    """grid x grid x grid x 7 poses (2: 56 poses; the paper's 3: 189) and a tilted scan by eqs. (10) and (11).
+def demo_setup(*, paper: bool = False, views: int = 180, small: bool = False) -> DemoSetup:
+    """57 poses at two table angles and a tilted scan by eqs. (10) and (11).
 
-    small: the detector read out in 4 x 4 bins, for a quick look.
+    paper: the paper's own 189 poses, table still;  small: the detector read out in 4 x 4 bins, for a quick look.
     """
-    from tomopose.trajectory.pose_grid import pose_grid
+    from tomopose.trajectory.pose_grid import calibration_grid, pose_grid
     from tomopose.trajectory.scan import tilted_scan
     from tomopose.trajectory.tilt import eq11_triangle
 
@@ -60,8 +60,9 @@ def demo_setup(*, grid: int = 2, views: int = 180, small: bool = False) -> DemoS
     return DemoSetup(
         scanner=scanner.binned(SMALL_BINNING) if small else scanner,
         T_HT=T_HT,
-        t=np.array([-0.85, 0.55, -0.65]),
-        poses=pose_grid(grid),
+        # the paper's start guess has the ball near the pivot; away from it rotations show in the images
+        t=np.array([-0.85, 0.55, -0.65] if paper else [9.15, -7.45, 15.35]),
+        poses=pose_grid(3) if paper else calibration_grid(2),
         scan=tilted_scan(views, eq11_triangle, R_HT=T_HT.R),
     )
 
@@ -83,6 +84,6 @@ def rehearse(setup: DemoSetup) -> None:
     noise = np.random.default_rng(setup.seed).normal(scale=100.0, size=ball.shape)
     detect([(20000 * ball + noise + 1000).astype(np.uint16)], tiny, ball_diameter=setup.ball_diameter)
     poses = setup.poses
-    x_D = project_ball(setup.scanner, T_HT=setup.T_HT, T_MH=poses.T_MH, t=setup.t)
+    x_D = project_ball(setup.scanner, T_HT=setup.T_HT, T_MH=poses.T_MH, t=setup.t, alpha=poses.alpha)
     calibration = calibrate(setup.scanner, poses, BallObservations.from_sigma(x_D, 0.01, pose_id=poses.pose_id))
     projection_matrices(calibration, setup.scan.select([0]))

@@ -58,7 +58,7 @@ class Path:
 
 def path_of(scan: PoseSequence, magnification: float) -> Path:
     """The source's path of a scan by the true mount, taken from the matrices of eq. (5)."""
-    setup, scanner = demo_setup(), paper_scanner(magnification)
+    setup, scanner = demo_setup(paper=True), paper_scanner(magnification)
     alpha = np.zeros(len(scan)) if scan.alpha is None else scan.alpha
     P = eq5_matrices(scanner, T_HT=setup.T_HT, T_MH=scan.T_MH, alpha=alpha)
     turned = scanner.T_WS.R.T @ np.linalg.inv(scanner.K) @ P[:, :, :3]
@@ -135,7 +135,7 @@ def crossings(values: Array) -> int:
 
 def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any, Any, Any, Any]:
     """Rows, checks, figures and notes; nothing here is random."""
-    R_HT = demo_setup().T_HT.R
+    R_HT = demo_setup(paper=True).T_HT.R
     rows: list[StudyRow] = []
     checks: list[StudyCheck] = []
     paths = {}

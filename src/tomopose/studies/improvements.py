@@ -97,7 +97,7 @@ def hexapod_experiment(poses: Callable[[np.random.Generator], PoseSequence], bal
     """A maker of experiments with the hexapod, by random generator."""
 
     def make(rng: np.random.Generator) -> Experiment:
-        T_HT = demo_setup().T_HT
+        T_HT = demo_setup(paper=True).T_HT
         exact = replace(typical_hexapod(), scale_sigma=0.0, geometry_sigma=0.0)  # the controller knows its geometry
         return Experiment(
             machine=exact,
@@ -227,7 +227,7 @@ def solve_case(name: str, seed: int) -> dict[str, Any]:
 
 def table_row() -> StudyRow:
     """u of t_HT along the beam: 112 poses at table angle 0 against 56 at 0 and 56 at 90 degrees; no randomness."""
-    setup, scanner = demo_setup(), paper_scanner()
+    setup, scanner = demo_setup(paper=True), paper_scanner()
     u = []
     for poses in (pose_grid((2, 2, 4)), pose_grid(2, table_angles=QUARTERS[:2])):
         x = project_ball(scanner, T_HT=setup.T_HT, T_MH=poses.T_MH, t=setup.t, alpha=alpha_of(poses))

@@ -78,7 +78,7 @@ def cases(scale: Scale) -> tuple[Case, ...]:
 
 def ball_run(magnification: float, n: int, seed: int) -> BallRun:
     """A perfect manipulator in the paper's scanner; mount and ball near the paper's, at (0, 0, pi) and the pivot."""
-    setup = demo_setup()
+    setup = demo_setup(paper=True)
     poses = pose_grid(n)
     entropy = np.random.SeedSequence([seed, round(10 * magnification), n])
     return BallRun(

@@ -85,7 +85,7 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
         views, planes = VIEWS[scale], PLANES[scale]
         scans = {
             "circular scan": circular_scan(views),
-            "3D scan": tilted_scan(views, WAVES[magnification], R_HT=demo_setup().T_HT.R),
+            "3D scan": tilted_scan(views, WAVES[magnification], R_HT=demo_setup(paper=True).T_HT.R),
         }
         share = {}
         for name, scan in scans.items():
@@ -129,7 +129,7 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
     for k, (name, scan) in enumerate(
         (
             ("circular scan", circular_scan(views)),
-            ("3D scan", tilted_scan(views, WAVES[tuy_discs.MAGNIFICATION], R_HT=demo_setup().T_HT.R)),
+            ("3D scan", tilted_scan(views, WAVES[tuy_discs.MAGNIFICATION], R_HT=demo_setup(paper=True).T_HT.R)),
         )
     ):
         discs[name] = steps.of(f"discs-{k}", lambda scan=scan: tuy_discs.disc_profile(scan, scale))  # type: ignore[misc]

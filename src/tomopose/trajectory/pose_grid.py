@@ -1,4 +1,4 @@
-"""The paper's calibration poses: a grid of positions, seven orientations at each.  Paper sec. 5, fig. 5."""
+"""Calibration poses on a grid of positions: the paper's (sec. 5, fig. 5), and ours, which shows what that cannot."""
 
 from __future__ import annotations
 
@@ -25,6 +25,16 @@ def seven_orientations(tilt: float | Sequence[float] = TILT) -> Array:
     for axis in range(3):
         angles[1 + 2 * axis, axis], angles[2 + 2 * axis, axis] = by_axis[axis], -by_axis[axis]
     return angles
+
+
+def compound_orientations(tilt: float | Sequence[float] = TILT) -> Array:
+    """Angles (7, 3), rad: none, then six turns about all three axes together, no two in the same sense.
+
+    Turns about one axis at a time leave the order of the three rotations unknown; these show it.
+    """
+    by_axis = np.broadcast_to(np.asarray(tilt, dtype=np.float64), (3,))
+    senses = [(0, 0, 0), (1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1), (-1, -1, -1), (1, 1, -1)]
+    return np.array(senses, dtype=np.float64) * by_axis
 
 
 def grid_positions(n: int | Sequence[int], half_range: float | Sequence[float] = HALF_RANGE_MM) -> Array:
@@ -83,6 +93,36 @@ def pose_grid(
         T_MH=T_MH,
         pose_id=tuple(str(i) for i in range(k * m * a)),
         alpha=np.repeat(table, k * m),
+        pivot=pivot,
+        source="set",
+    )
+
+
+def calibration_grid(
+    n: int | Sequence[int] = 3,
+    *,
+    half_range: float | Sequence[float] = HALF_RANGE_MM,
+    tilt: float | Sequence[float] = TILT,
+    table_angles: Sequence[float] = (0.0, math.pi / 2),
+    pivot: Array | None = None,
+) -> PoseSequence:
+    """n x n x n x 7 + 1 calibration poses that determine the scanner too: compound rotations, the table at two angles.
+
+    Every position is taken at one of the table angles, in turn along the grid, so that there are as many images as in
+    the paper's plan; all positions of one angle come before those of the next.  The first pose is taken again at the
+    end: what has moved in between shows.  Parameters as of `pose_grid`.
+    """
+    table = np.atleast_1d(np.asarray(table_angles, dtype=np.float64))
+    angles, positions = compound_orientations(tilt), grid_positions(n, half_range)
+    turn = np.arange(len(positions)) % len(table)
+    order = np.argsort(turn, kind="stable")
+    k = np.append(np.repeat(order, len(angles)), order[0])
+    j = np.append(np.tile(np.arange(len(angles)), len(order)), 0)
+    T_MH = RigidTransform(R=rotation_from_angles(angles[j]), t=positions[k], source=Frame.M, target=Frame.H)
+    return PoseSequence(
+        T_MH=T_MH,
+        pose_id=tuple(str(i) for i in range(len(k))),
+        alpha=table[turn[k]],
         pivot=pivot,
         source="set",
     )

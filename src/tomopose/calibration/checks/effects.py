@@ -67,8 +67,16 @@ SCANNER_WORDS = {
     "p_u": ("the pixel pitch p_u is off by {:+.3g} um", 1e3, "pitch p_u"),
     "p_v": ("the pixel pitch p_v is off by {:+.3g} um", 1e3, "pitch p_v"),
     "axis_y": ("the table axis passes W by {:+.3g} um (axis_y)", 1e3, "offset of the table axis (axis_y)"),
-    "axis_tilt_x": ("the table axis is tilted (axis_tilt_x) by {:+.3g} mrad", 1e3, "tilt of the table axis (axis_tilt_x)"),
-    "axis_tilt_y": ("the table axis is tilted (axis_tilt_y) by {:+.3g} mrad", 1e3, "tilt of the table axis (axis_tilt_y)"),
+    "axis_tilt_x": (
+        "the table axis is tilted (axis_tilt_x) by {:+.3g} mrad",
+        1e3,
+        "tilt of the table axis (axis_tilt_x)",
+    ),
+    "axis_tilt_y": (
+        "the table axis is tilted (axis_tilt_y) by {:+.3g} mrad",
+        1e3,
+        "tilt of the table axis (axis_tilt_y)",
+    ),
     "translation_scale": ("the manipulator's translations have the scale 1 {:+.3g}", 1.0, "translation scale"),
 }
 
@@ -138,7 +146,9 @@ def _panel(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
                 name="radial distortion",
                 kind="panel",
                 short="radial distortion of the panel",
-                words=lambda size, px, at: f"the panel shows a radial distortion of {float(size[0]):+.2g} px at its corners",
+                words=lambda size, px, at: (
+                    f"the panel shows a radial distortion of {float(size[0]):+.2g} px at its corners"
+                ),
             ),
             C=_white(problem, radial[:, :, None]),
         )
@@ -175,7 +185,9 @@ def _manipulator(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
                 name=f"scale of {c}",
                 kind="manipulator",
                 short=f"translation scale of {c}",
-                words=lambda size, px, at, c=c: f"the manipulator's {c} has the translation scale 1 {float(size[0]):+.2g}",
+                words=lambda size, px, at, c=c: (
+                    f"the manipulator's {c} has the translation scale 1 {float(size[0]):+.2g}"
+                ),
             ),
             C=_white(problem, (b.G_H[:, :, i] * t[:, i, None])[:, :, None]),
         )
@@ -195,9 +207,11 @@ def _manipulator(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
                 name="rotation scale",
                 kind="manipulator",
                 short="rotation scale",
-                words=lambda size, px, at: "the manipulator's rotation scale is 1 "
-                + ", ".join(f"{float(s):+.2g}" for s in size)
-                + " about x, y, z",
+                words=lambda size, px, at: (
+                    "the manipulator's rotation scale is 1 "
+                    + ", ".join(f"{float(s):+.2g}" for s in size)
+                    + " about x, y, z"
+                ),
             ),
             C=_white(problem, scale),
         )
@@ -220,9 +234,7 @@ def _table(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
     else:
         waves = np.eye(len(angles))[which][:, 1:]
     turn = by_angle[:, :, None] * waves[:, None, :]
-    found = [
-        Columns(effect=_fixed("table angle", "table", "errors of the table's angle"), C=_white(problem, turn))
-    ]
+    found = [Columns(effect=_fixed("table angle", "table", "errors of the table's angle"), C=_white(problem, turn))]
     if len(angles) > FEW_ANGLES:
         G = b.J_t_HT
         shift = (G[:, :, :, None] * waves[:, None, None, :]).reshape(len(alpha), 2, -1)
@@ -244,7 +256,13 @@ def _drifts(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
     image = np.broadcast_to(np.eye(2), (len(problem), 2, 2))
     for order, ending in ((1, "linear"), (DRIFT_ORDER, "curved")):
         for name, short, text, factor, base in (
-            ("image drift", "drift of the focal spot or the images", "the images drift by {:.2g} px over the run (focal spot or detector)", 1.0, image),
+            (
+                "image drift",
+                "drift of the focal spot or the images",
+                "the images drift by {:.2g} px over the run (focal spot or detector)",
+                1.0,
+                image,
+            ),
             ("ball drift", "drift of the ball", "the ball drifts by {:.2g} um over the run", 1000.0, b.J_t_HT),
         ):
             C = (base[:, :, None, :] * course[:, None, :order, None]).reshape(len(problem), 2, -1)
@@ -262,22 +280,33 @@ def _step_effect(name: str, short: str, text: str, part: slice, factor: float, u
 
 def steps_of(problem: Problem, b: ProjectionBlocks) -> list[Steps]:
     """What may change from one pose to the next: the ball, the mount, the images."""
-    n, balls = len(problem), len(problem.ball_ids)
+    n = len(problem)
     J_mount = problem.W @ b.J_mount
     return [
         Steps(
-            effect=_step_effect("ball step", "the ball slipped", "the ball changed its place (slipped)", slice(0, 3), 1000.0, "um"),
+            effect=_step_effect(
+                "ball step", "the ball slipped", "the ball changed its place (slipped)", slice(0, 3), 1000.0, "um"
+            ),
             C=problem.W @ b.J_t,
             least=2,
         ),
         Steps(
-            effect=_step_effect("mount step", "the mount moved", "the mount changed (bumped or referenced anew)", slice(3, 6), 1000.0, "um"),
+            effect=_step_effect(
+                "mount step",
+                "the mount moved",
+                "the mount changed (bumped or referenced anew)",
+                slice(3, 6),
+                1000.0,
+                "um",
+            ),
             C=J_mount,
             least=3,
         ),
         Steps(
-            effect=_step_effect("image step", "the images jumped", "the images jumped (focal spot or detector)", slice(0, 2), 1.0, "px"),
+            effect=_step_effect(
+                "image step", "the images jumped", "the images jumped (focal spot or detector)", slice(0, 2), 1.0, "px"
+            ),
             C=np.array(np.broadcast_to(problem.W @ np.eye(2), (n, 2, 2))),
             least=2,
         ),
-    ][: 3 if balls else 3]
+    ]

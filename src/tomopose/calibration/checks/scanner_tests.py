@@ -1,17 +1,17 @@
 r"""The culprit, not the symptom: one ranked list of single explanations of what a fit leaves.
 
-Each effect is a set of columns C: what the centres would do if it were so.  With r the whitened residuals of a fit whose
-Jacobian (priors as rows) has the orthonormal basis Q, the effect explains
+Each effect is a set of columns C: what the centres would do if it were so.  With r the whitened residuals of a fit
+whose Jacobian (priors as rows) has the orthonormal basis Q, the effect explains
 
     gain = g^T M^+ g,    g = C^T (1 - Q Q^T) r,    M = C^T (1 - Q Q^T) C,
 
 of chi2: a score test, no refit is needed.  Effects with different numbers of columns are compared by their evidence,
 
-    evidence = (dof / 2) ln(chi2 / (chi2 - gain)) - (c / 2) ln(2 n) - ln(looks)     [chi2 known: gain / 2 in place of the first],
+    evidence = min((dof / 2) ln(chi2 / (chi2 - gain)), gain / 2) - (c / 2) ln(2 n) - ln(looks),
 
 Schwarz's approximation (Ann. Statist. 6 (1978) 461), in natural log units; `looks` counts the effects and, for a step,
-the poses at which it could have happened.  The first form lets no effect look significant where something else leaves
-more than the stated sigmas explain.
+the poses at which it could have happened.  The first of the two lets no effect look significant where something else
+leaves more than the stated sigmas explain; the second holds where the stated sigmas are too large.
 """
 
 from __future__ import annotations
@@ -315,21 +315,26 @@ def scanner_tests(problem: Problem, free: FreeParameters, fit: Fit) -> ScannerTe
     b = blocks(problem, free, fit)
     white = whitened(problem, free, fit)
     columns, steps = effects_of(problem, b), steps_of(problem, b)
-    freed = {name for name in free.names}
+    freed = set(free.names)
     beside = ranked_explanations(problem, white, [c for c in columns if c.effect.name not in freed], steps)
     kept = [name for name, s in zip(free.names, free.sigma, strict=True) if np.isinf(s)]
     held = free_parameters(
-        problem.scanners, free=[n for n in kept if "[" not in n], fix=[n for n in problem.scanner.sigma if n not in kept]
+        problem.scanners,
+        free=[n for n in kept if "[" not in n],
+        fix=[n for n in problem.scanner.sigma if n not in kept],
     )
-    plain = minimise(problem, held, fit if not len(free) else Fit(
-        R_HT=fit.R_HT, t_HT=fit.t_HT, t=fit.t, delta=np.zeros(0), chi2=fit.chi2, converged=True, N=fit.N
-    ), iterations=30)
+    plain = minimise(
+        problem,
+        held,
+        fit
+        if not len(free)
+        else Fit(R_HT=fit.R_HT, t_HT=fit.t_HT, t=fit.t, delta=np.zeros(0), chi2=fit.chi2, converged=True, N=fit.N),
+        iterations=30,
+    )
     if not len(free) or not np.isfinite(plain.chi2):
         return ScannerTests(beside=beside, declared=beside, gain=0.0)
     before = whitened(problem, held, plain)
-    declared = ranked_explanations(
-        problem, before, [*effects_of(problem, blocks(problem, held, plain))], steps, most=1
-    )
+    declared = ranked_explanations(problem, before, [*effects_of(problem, blocks(problem, held, plain))], steps, most=1)
     together = (declared.chi2 - beside.chi2) / 2 - _occam(before, free, problem, b)
     return ScannerTests(beside=beside, declared=declared, gain=together)
 

@@ -3,49 +3,57 @@
 A value of the scanner with a standard deviation in scanner.json is estimated with it as prior.  One with 0 is exact, in
 the user's own words.  One with neither gets the default below.  The defaults are orders of magnitude of a well-kept
 metrology scanner whose alignment nobody has written down; where the poses determine a value, its default plays no
-part, and where they do not, the stated uncertainty of the scan shows it.
-
-| value | default | source |
-|---|---|---|
-| d_SD | 0.5 mm | reviews of geometrical calibration put a maker's distances at some tenths of a mm (Ferrucci et al., Meas. Sci. Technol. 26 (2015) 092003) |
-| d_SR | 0.2 mm | as above; the position of a magnification axis after its last reference run |
-| p_u, p_v | 1e-4 of the pitch | glass panels expand by 3e-6 to 8e-6 a kelvin, and pitches are printed with four digits |
-| u_0, v_0 | 0.5 px | the half pixel between counting from the corner and from the centre of a pixel |
-| eta | 1 mrad | 0.06 degrees: mechanical alignment by a spirit level; at 1000 columns 1 px of shear |
-| theta, phi | 2 mrad | 0.1 degrees: 0.8 mm over a panel of 400 mm, what a feeler gauge shows |
-| rotation scale | 5e-5 | the scale of a linear encoder with the geometry of its joints; a ball cannot tell it from its own lever |
-| table wobble | 0.1 um, 0.5 urad | radial, axial and tilt error motion of a rotary table with an air bearing, harmonics 1 and 2 |
-
-These numbers are no measurement of anybody's scanner: state your own in scanner.json.  axis_y and the tilts of the
-table axis have none, since the axis defines W: a displaced axis is a displaced and turned panel.
+part, and where they do not, the stated uncertainty of the scan shows it.  They are no measurement of anybody's scanner:
+state your own in scanner.json.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Literal
 
 from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 
-DEFAULTS: Mapping[str, Callable[[Scanner], float]] = MappingProxyType(
+
+@dataclass(frozen=True, kw_only=True)
+class Default:
+    """A standard deviation for a value that nobody stated: in its unit, or as a part of the value; and its source."""
+
+    sigma: float
+    source: str
+    relative: bool = False
+
+
+_DISTANCES = "makers state distances to some tenths of a mm: Ferrucci et al., Meas. Sci. Technol. 26 (2015) 092003"
+_PITCH = "glass expands by 3e-6 to 8e-6 a kelvin, and data sheets print pitches with four digits"
+_HALF_PIXEL = "half a pixel lies between counting from the corner and from the centre of a pixel"
+_AXIS = "the axis defines W; what is left of its alignment after a search for the centre of rotation"
+
+DEFAULTS: Mapping[str, Default] = MappingProxyType(
     {
-        "d_SD": lambda s: 0.5,
-        "d_SR": lambda s: 0.2,
-        "p_u": lambda s: 1e-4 * s.p_u,
-        "p_v": lambda s: 1e-4 * s.p_v,
-        "u_0": lambda s: 0.5,
-        "v_0": lambda s: 0.5,
-        "eta": lambda s: 1e-3,
-        "theta": lambda s: 2e-3,
-        "phi": lambda s: 2e-3,
+        "d_SD": Default(sigma=0.5, source=_DISTANCES),
+        "d_SR": Default(sigma=0.2, source=f"{_DISTANCES}; a magnification axis after its reference run"),
+        "p_u": Default(sigma=1e-4, relative=True, source=_PITCH),
+        "p_v": Default(sigma=1e-4, relative=True, source=_PITCH),
+        "u_0": Default(sigma=0.5, source=_HALF_PIXEL),
+        "v_0": Default(sigma=0.5, source=_HALF_PIXEL),
+        "eta": Default(sigma=1e-3, source="0.06 degrees, what a machinist's level shows of a panel"),
+        "theta": Default(sigma=2e-3, source="0.1 degrees: 0.8 mm over a panel of 400 mm"),
+        "phi": Default(sigma=2e-3, source="0.1 degrees: 0.8 mm over a panel of 400 mm"),
+        "axis_y": Default(sigma=0.02, source=_AXIS),
+        "axis_tilt_x": Default(sigma=2e-4, source=_AXIS),
+        "axis_tilt_y": Default(sigma=2e-4, source=_AXIS),
     }
 )
-"""Name -> standard deviation of a scanner's value that nobody stated, in the value's own unit."""
+"""Name -> default of a scanner's value, in the value's own unit."""
 
 ROTATION_SCALE = 5e-5
+"""Scale error of a platform's rotations: that of linear encoders with the geometry of the joints."""
+
 WOBBLE_MM, WOBBLE_RAD = 1e-4, 0.5e-6
+"""Radial, axial and tilt error motion of a rotary table with an air bearing, first harmonic."""
 
 Origin = Literal["scanner.json", "default", "exact", "option", "hexapod.json", "robot.json"]
 
@@ -66,6 +74,12 @@ class Assumed:
         return {"name": self.name, "sigma": self.sigma, "unit": self.unit, "from": self.origin}
 
 
+def default_sigma(scanner: Scanner, name: str) -> float:
+    """The default of one value of this scanner, in the value's unit."""
+    default = DEFAULTS[name]
+    return default.sigma * (abs(getattr(scanner, name)) if default.relative else 1.0)
+
+
 def assumed_of(scanner: Scanner, *, skip: Iterable[str] = ()) -> tuple[Assumed, ...]:
     """What a calibration assumes of this scanner; `skip`: values that are not assumed but freed or without effect."""
     known = set(skip)
@@ -74,7 +88,7 @@ def assumed_of(scanner: Scanner, *, skip: Iterable[str] = ()) -> tuple[Assumed, 
         if name in known or (name not in scanner.sigma and name not in DEFAULTS):
             continue
         stated = scanner.sigma.get(name)
-        sigma = DEFAULTS[name](scanner) if stated is None else stated
+        sigma = default_sigma(scanner, name) if stated is None else stated
         origin: Origin = "default" if stated is None else "exact" if stated == 0 else "scanner.json"
         found.append(Assumed(name=name, sigma=sigma, unit=PARAMETER_UNITS[name], origin=origin))
     return tuple(found)

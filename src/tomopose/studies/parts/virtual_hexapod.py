@@ -64,7 +64,7 @@ def believed_hexapod(magnification: float) -> Hexapod:
 
 def ball_run(magnification: float, n: int, seed: int, *, number: int) -> BallRun:
     """Calibration run `number` of the virtual hexapod: n x n x n x 7 poses, its own scatter and noise."""
-    setup, poses = demo_setup(), pose_grid(n)
+    setup, poses = demo_setup(paper=True), pose_grid(n)
     entropy = np.random.SeedSequence([seed, round(10 * magnification), n, number])
     motion, images = entropy.spawn(2)
     return BallRun(

@@ -88,7 +88,7 @@ def specimen(edge: float) -> TriangleMesh:
 def scan_with(thing: Object, path: Path, numbers: Numbers, seed: int) -> Scan:
     """A scan of an object by the erring hexapod, which a circular scan does not move."""
     m, binning, views = MAGNIFICATION[thing], numbers.binning[thing], numbers.views[thing]
-    full, setup = paper_scanner(m), demo_setup()
+    full, setup = paper_scanner(m), demo_setup(paper=True)
     poses = scan_of(m, views) if path == "3D" else circular_scan(views)
     motion, noise = np.random.SeedSequence([seed, 6, round(10 * m), path == "3D"]).spawn(2)
     T_MH = real_T_MH(poses, m, np.random.default_rng(motion)) if path == "3D" else poses.T_MH
