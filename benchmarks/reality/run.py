@@ -186,7 +186,7 @@ def cases(quick: bool) -> list[tuple[str, str, Bend]]:
 def table(outcomes: list[Outcome], title: str) -> None:
     print(f"\n{title}")
     print(
-        f"{'bend':21s} {'size':16s} {'runs':>4s} {'trust':>5s} {'> 3 s':>5s} {'worst':>7s} {'true':>8s} {'named':>6s}"
+        f"{'bend':20s} {'size':16s} {'runs':>4s} {'trust':>5s} {'> 3 s':>5s} {'worst':>7s} {'true':>8s} {'named':>5s}"
     )
     groups: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
     for o in outcomes:
@@ -199,7 +199,7 @@ def table(outcomes: list[Outcome], title: str) -> None:
         share = f"{sum(named)}/{len(named)}" if named else "-"
         true = np.nanmedian([o.true for o in group])
         print(
-            f"{bend:21s} {size:16s} {len(group):4d} {len(trusted):5d} {len(bad):5d} {worst:7.2f} {true:8.4f} {share:>6s}"
+            f"{bend:20s} {size:16s} {len(group):4d} {len(trusted):5d} {len(bad):5d} {worst:7.2f} {true:8.4f} {share:>5s}"
         )
 
 

@@ -13,6 +13,7 @@ from tomopose import Scanner
 from tomopose.errors import InputError
 from tomopose.geometry.projection import project
 from tomopose.geometry.rotations import R_x, R_y, R_z
+from tomopose.geometry.scanner import PARAMETER_UNITS
 
 
 def test_tilted_panel_by_intersecting_rays_with_it(scanner, rng):
@@ -93,7 +94,7 @@ def test_scanner_survives_pickling(scanner):
         ({"theta": 2.0}, "degrees"),
         ({"image_rows": "upside-down"}, "image_rows"),
         ({"sigma": {"d_XY": 1.0}}, "d_XY"),
-        ({"sigma": {"d_SR": 0.0}}, "sigma of d_SR"),
+        ({"sigma": {"d_SR": -0.1}}, "sigma of d_SR"),
     ],
 )
 def test_impossible_scanners_are_refused(scanner, change, message):
@@ -105,3 +106,11 @@ def test_impossible_scanners_are_refused(scanner, change, message):
 def test_impossible_binning_is_refused(scanner, factor):
     with pytest.raises(InputError, match="binning factor"):
         scanner.binned(factor)
+
+
+def test_a_sigma_of_zero_says_that_a_value_is_exact(scanner):
+    stated = replace(scanner, sigma={"d_SR": 0.0, "u_0": 0.3})
+    assert dict(stated.sigma) == {"d_SR": 0.0, "u_0": 0.3}
+    exact = stated.exact()
+    assert exact.sigma["u_0"] == 0.3
+    assert all(exact.sigma[name] == 0.0 for name in PARAMETER_UNITS if name != "u_0")
