@@ -199,7 +199,7 @@ def table(outcomes: list[Outcome], title: str) -> None:
         share = f"{sum(named)}/{len(named)}" if named else "-"
         true = np.nanmedian([o.true for o in group])
         print(
-            f"{bend:20s} {size:16s} {len(group):4d} {len(trusted):5d} {len(bad):5d} {worst:7.2f} {true:8.4f} {share:>5s}"
+            f"{bend:20s} {size:16s} {len(group):4d} {len(trusted):5d} {len(bad):5d} {worst:7.2f} {true:8.4f} {share:5s}"
         )
 
 
