@@ -12,11 +12,11 @@ from .calibration.checks.convention_tests import diagnose as diagnose
 from .calibration.checks.conventions import Rival as Rival
 from .calibration.model.problem import Problem as Problem
 from .calibration.projection_matrices import projection_matrices as projection_matrices
+from .calibration.records.charts import ControlChart as ControlChart
+from .calibration.records.charts import control_chart as control_chart
 from .calibration.records.compare import Comparison as Comparison
 from .calibration.records.compare import compare as compare
-from .calibration.records.history import ControlChart as ControlChart
 from .calibration.records.history import append_history as append_history
-from .calibration.records.history import control_chart as control_chart
 from .calibration.records.history import read_history as read_history
 from .calibration.records.truth import d_rms_exact as d_rms_exact
 from .calibration.result import Calibration as Calibration

@@ -11,8 +11,9 @@ from calibration_cases import BALL, MOUNT, SCANNER, SIGMA, mixed_poses, observe,
 from tomopose.calibration.model.covariance import inverse_information
 from tomopose.calibration.model.parameters import free_parameters
 from tomopose.calibration.model.problem import pair
+from tomopose.calibration.records.charts import control_chart
 from tomopose.calibration.records.compare import compare
-from tomopose.calibration.records.history import append_history, control_chart, read_history
+from tomopose.calibration.records.history import append_history, read_history
 from tomopose.calibration.rigid.estimate import best_fit
 from tomopose.calibration.rigid.pose_error_field import (
     PoseField,

@@ -111,23 +111,6 @@ def test_doctor_lists_engines_and_install_lines(capsys):
     assert shown["extras"]["recon"]["install"].startswith("pip install")
 
 
-def test_compare_and_monitor(files, capsys):
-    f = files.folder
-    for out in ("a", "b", "c"):
-        assert run(files.calibrate(out)) == 0
-    a, b = str(f / "a" / "calibration.json"), str(f / "b" / "calibration.json")
-    assert run(["compare", a, b, "--json", "--out", str(f / "change.html")]) == 0
-    shown = json.loads(capsys.readouterr().out)
-    assert shown["mount_changed"] is False
-    assert_allclose(shown["difference"], 0, atol=MILLIMETRE)
-    for out in ("a", "b", "c"):
-        words = ["monitor", str(f / "history.jsonl"), "--add", str(f / out / "calibration.json"), "--label", out]
-        assert run([*words, "--quiet"]) == 0
-    assert run(["monitor", str(f / "history.jsonl"), "--out", str(f / "history.html"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["calibrations"] == 3
-    assert (f / "history.html").stat().st_size > 1000
-
-
 def test_a_rival_that_fits_better_is_exit_code_3(files, capsys):
     """Rows exchanged among poses: the files are well formed, but the reading of them is wrong."""
     wrong = files.folder / "signs.csv"

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tomopose.cli.common import OK, ForceOption, JsonOption, QuietOption, Say
+from tomopose.cli.common import NOT_TRUSTWORTHY, OK, ForceOption, JsonOption, QuietOption, Say
 
 EPILOG = "Example: tomopose compare before/calibration.json after/calibration.json --out change.html"
 
@@ -24,7 +24,11 @@ def compare(
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> int:
-    """Say what changed from calibration A to calibration B, with its uncertainty and significance (paper, table 2)."""
+    """Say what changed from calibration A to calibration B, with its uncertainty and significance (paper, table 2).
+
+    A changed scanner.json is named first; the mount is then not tested, since T_HT depends on it.  Exit code 3 says
+    that something changed.
+    """
     import tomopose as tp
     from tomopose.files import require_absent
     from tomopose.report import comparison_report, write_report
@@ -41,4 +45,4 @@ def compare(
         for name, d, u, z in zip(found.names, found.difference, found.u, found.z, strict=True)
     ]
     say.result({**found.to_json(), "mount_changed": found.mount_changed}, [*found.words, *changes])
-    return OK
+    return NOT_TRUSTWORTHY if found.changed else OK

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc
 
+from tomopose.calibration.records.setup import held_scanner, scanner_changes
 from tomopose.calibration.result import Calibration
 from tomopose.errors import InputError
 from tomopose.geometry.rotations import log_rotation
@@ -15,6 +16,7 @@ from tomopose.manipulator.poses import PIVOT_TOLERANCE_MM
 from tomopose.units import Array
 
 SIGNIFICANT = 0.01
+NOT_TESTED = (float("nan"), float("nan"))
 MOUNT = tuple(f"{what}_HT_{c}" for what in "wt" for c in "xyz")
 
 
@@ -27,6 +29,8 @@ class Comparison:
     p:           (m,) probability of a change of at least this size by chance.
     chi2_mount, p_mount: of the six coordinates of T_HT together;  chi2_all, p_all: of all.
     words:       one sentence a finding.
+    scanner:     scanner values that differ, "d_SR_mm 283.5 -> 284".  T_HT is then another quantity: the mount is not
+                 tested, chi2_mount and the probabilities are NaN.
     """
 
     names: tuple[str, ...]
@@ -39,10 +43,16 @@ class Comparison:
     chi2_all: float
     p_all: float
     words: tuple[str, ...]
+    scanner: tuple[str, ...] = ()
 
     @property
     def mount_changed(self) -> bool:
         return self.p_mount < SIGNIFICANT
+
+    @property
+    def changed(self) -> bool:
+        """Whether anything changed: scanner.json, the mount, the ball or an estimated scanner value."""
+        return bool(self.scanner) or self.mount_changed or self.p_all < SIGNIFICANT
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -56,6 +66,8 @@ class Comparison:
             "chi2_all": self.chi2_all,
             "p_all": self.p_all,
             "words": list(self.words),
+            "scanner_changes": list(self.scanner),
+            "changed": self.changed,
         }
 
 
@@ -86,9 +98,11 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
     u = np.sqrt(np.diag(C))
     z = d / u
     mount = [k for k, n in enumerate(names) if n in MOUNT]
-    chi2_mount, p_mount = _together(d[mount], C[np.ix_(mount, mount)])
-    chi2_all, p_all = _together(d, C)
-    p = _two_sided(z)
+    scanner = scanner_changes(held_scanner(a), held_scanner(b))
+    (chi2_mount, p_mount), (chi2_all, p_all) = (
+        (NOT_TESTED, NOT_TESTED) if scanner else (_together(d[mount], C[np.ix_(mount, mount)]), _together(d, C))
+    )
+    p = np.full(len(d), np.nan) if scanner else _two_sided(z)
     return Comparison(
         names=names,
         difference=d,
@@ -99,21 +113,33 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         p_mount=p_mount,
         chi2_all=chi2_all,
         p_all=p_all,
-        words=_words(a, b, names, z, p_mount, p_all),
+        words=_words(a, b, names, z, p_mount, p_all, scanner),
+        scanner=scanner,
     )
 
 
 def _words(
-    a: Calibration, b: Calibration, names: tuple[str, ...], z: Array, p_mount: float, p_all: float
+    a: Calibration,
+    b: Calibration,
+    names: tuple[str, ...],
+    z: Array,
+    p_mount: float,
+    p_all: float,
+    scanner: tuple[str, ...],
 ) -> tuple[str, ...]:
-    words = [
-        f"the mount T_HT {'changed significantly' if p_mount < SIGNIFICANT else 'did not change significantly'} "
-        f"(p = {p_mount:.2g})"
-    ]
+    if scanner:
+        words = [
+            f"scanner.json changed: {'; '.join(scanner)}. T_HT depends on these values, so the mount is not tested; "
+            "calibrate both runs with one scanner.json to compare them"
+        ]
+    else:
+        changed = "changed significantly" if p_mount < SIGNIFICANT else "did not change significantly"
+        words = [f"the mount T_HT {changed} (p = {p_mount:.2g})"]
     if p_mount >= SIGNIFICANT > p_all:
         words.append(f"the ball or the scanner's values changed (p = {p_all:.2g})")
     largest = int(np.abs(z).argmax())
-    words.append(f"the largest change is {names[largest]}, {abs(z[largest]):.1f} standard uncertainties")
+    if not scanner:
+        words.append(f"the largest change is {names[largest]}, {abs(z[largest]):.1f} standard uncertainties")
     only = set(a.tangent) ^ set(b.tangent)
     if only:
         words.append(f"not in both and not compared: {', '.join(sorted(only))}")

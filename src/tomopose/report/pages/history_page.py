@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.records.compare import SIGNIFICANT, Comparison
-from tomopose.calibration.records.history import ControlChart, control_chart
+from tomopose.calibration.records.charts import FEWEST_RUNS, ControlChart, control_chart
+from tomopose.calibration.records.compare import Comparison
+from tomopose.calibration.records.history import Entry
+from tomopose.calibration.records.monitor import Monitoring, monitor
 from tomopose.errors import InputError
 from tomopose.report.page import CARE, GOOD, Block, Figure, Page, Section, Table, Verdict, render
 from tomopose.report.pages.checks_section import probability
@@ -17,7 +19,6 @@ from tomopose.report.words import meaning, number, small_unit, symbol
 from tomopose.units import MICROMETRES_PER_MM, MICRORADIANS_PER_RAD
 
 CHARTED = ("d_rms_px", "t_HT_x", "t_HT_y", "t_HT_z", "phi_HT_x", "phi_HT_y", "phi_HT_z")
-FEWEST_ENTRIES = 3
 COVERAGE_FACTOR = 2.0
 SCALES: Mapping[str, tuple[float, str]] = {
     "mm": (MICROMETRES_PER_MM, "µm"),
@@ -33,7 +34,6 @@ def comparison_report(
 
     labels: names of the two calibrations.
     """
-    changed = comparison.mount_changed or comparison.p_all < SIGNIFICANT
     units = {"w": "rad", "t": "mm"}
     rows = []
     for name, d, u, z, p in zip(
@@ -48,7 +48,7 @@ def comparison_report(
                 small_unit(u, unit),
                 small_unit(COVERAGE_FACTOR * u, unit),
                 f"{z:+.2f}",
-                probability(p),
+                "–" if np.isnan(p) else probability(p),
             ]
         )
     figure = Figure(
@@ -91,9 +91,13 @@ def comparison_report(
         numeric=(2, 3, 4, 5, 6),
     )
     verdict = Verdict(
-        word="Changed" if changed else "Unchanged",
-        tone=CARE if changed else GOOD,
-        sentence=f"Probability of a change of the mount this large by chance: {probability(comparison.p_mount)}.",
+        word="Changed" if comparison.changed else "Unchanged",
+        tone=CARE if comparison.changed else GOOD,
+        sentence=(
+            "The two calibrations assume different scanners, so their mounts cannot be compared."
+            if comparison.scanner
+            else f"Probability of a change of the mount this large by chance: {probability(comparison.p_mount)}."
+        ),
         reasons=comparison.words,
     )
     return render(
@@ -113,12 +117,12 @@ def signed(value: float, unit: str) -> str:
     return f"{'−' if value < 0 else '+'}{number(abs(value) * factor)} {name}".rstrip()
 
 
-def history_section(entries: Sequence[Mapping[str, Any]]) -> Section | None:
-    """Control charts of the mount and the residual; None with fewer than three entries."""
-    if len(entries) < FEWEST_ENTRIES:
+def history_section(entries: Sequence[Entry], alarmed: Sequence[str] = ()) -> Section | None:
+    """Control charts of the mount, the residual and what raised an alarm; None with fewer than three entries."""
+    if len(entries) < FEWEST_RUNS:
         return None
     charts = []
-    for name in CHARTED:
+    for name in dict.fromkeys((*CHARTED, *alarmed)):
         try:
             charts.append(control_chart(entries, name))
         except InputError:  # a parameter that too few entries hold
@@ -183,15 +187,29 @@ def chart_figure(chart: ControlChart) -> Figure:
     )
 
 
-def history_report(entries: Sequence[Mapping[str, Any]], *, title: str = "Calibrations over time") -> str:
-    """One offline HTML document with control charts.
+def history_verdict(found: Monitoring) -> Verdict:
+    """The answer of the rules as the page's verdict."""
+    return Verdict(
+        word="Alarm" if found.alarms else "No alarm",
+        tone=CARE if found.alarms else GOOD,
+        sentence=found.words[0][:1].upper() + found.words[0][1:] + ".",
+        reasons=(*found.words[1:], *found.notes),
+    )
 
-    entries: of a history file, oldest first (`tomopose.calibration.records.history.read_history`).
+
+def history_report(
+    entries: Sequence[Entry], *, title: str = "Calibrations over time", baseline: str | None = None
+) -> str:
+    """One offline HTML document with the answer of the rules and control charts.
+
+    entries: of a history file, oldest first (`tomopose.calibration.records.history.read_history`);  baseline: the runs
+    that define the normal state, as in `tomopose.calibration.records.monitor.monitor`.
     InputError with fewer than three.
     """
-    section = history_section(entries)
+    found = monitor(entries, baseline=baseline)
+    section = history_section(entries, [a.parameter for a in found.alarms])
     if section is None:
-        raise InputError(f"the history holds {len(entries)} calibrations; control charts need {FEWEST_ENTRIES}")
+        raise InputError(f"the history holds {len(entries)} calibrations; control charts need {FEWEST_RUNS}")
     table = Table(
         title="Entries",
         meaning="",
@@ -214,6 +232,7 @@ def history_report(entries: Sequence[Mapping[str, Any]], *, title: str = "Calibr
         Page(
             title=title,
             subtitle=f"{len(entries)} calibrations, {entries[0]['time_utc']} to {entries[-1]['time_utc']}",
+            verdict=history_verdict(found),
             sections=[section, Section(title="All entries", blocks=[table])],
             footer="Written by tomopose. Bars are expanded uncertainties, k = 2.",
         )
