@@ -332,7 +332,7 @@ def test_no_rotation_at_all_is_no_unit_error(table):
 
 
 def test_angles_beyond_a_turn_are_no_degrees(table):
-    with pytest.raises(UnitError, match="no orientation in degrees"):
+    with pytest.raises(UnitError, match="not an orientation in degrees"):
         read_poses(table(GOOD.replace("-5,1", "-5000,1")))
 
 
@@ -431,3 +431,28 @@ def test_no_text_makes_the_reader_fail_otherwise_than_on_purpose(tmp_path, text)
         warnings.simplefilter("ignore", InputWarning)
         with pytest.raises((InputError, FileError)):
             read_poses(path)
+
+
+def robot_table(tmp_path, convention, scale, comment=""):
+    columns = {"ur": "rx_rad,ry_rad,rz_rad", "kuka": "a_deg,b_deg,c_deg", "pi-hexapod": "rx_deg,ry_deg,rz_deg"}
+    rows = [f"{k},{0.51 * scale},{-0.05 * scale},{(0.58 + 0.01 * k) * scale},1.5,0.2,-0.7" for k in range(5)]
+    head = [f"# convention: {convention}", *comment.splitlines(), f"pose_id,x_mm,y_mm,z_mm,{columns[convention]}"]
+    path = tmp_path / "robot.csv"
+    path.write_text("\n".join([*head, *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("convention", ["ur", "kuka"])
+def test_metres_in_a_robots_table_are_named_and_may_be_confirmed(tmp_path, convention):
+    with pytest.raises(UnitError, match=r"x_mm, y_mm, z_mm: positions look like metres \(largest 0\.62, which is 620"):
+        read_poses(robot_table(tmp_path, convention, 1.0))
+    assert read_poses(robot_table(tmp_path, convention, 1000.0)).T_MH.t[0, 0] == 510.0
+    assert read_poses(robot_table(tmp_path, convention, 1.0, "# units: confirmed")).units_confirmed
+    # a hexapod's plan of half a millimetre is one
+    assert read_poses(robot_table(tmp_path, "pi-hexapod", 1.0)).T_MH.t[0, 0] == 0.51
+
+
+def test_a_robots_small_table_that_was_written_is_read_back(tmp_path):
+    poses = read_poses(robot_table(tmp_path, "pi-hexapod", 1.0))
+    write_poses(tmp_path / "back.csv", poses, convention="kuka")
+    np.testing.assert_allclose(read_poses(tmp_path / "back.csv").T_MH.matrix, poses.T_MH.matrix, atol=1e-12)

@@ -229,11 +229,12 @@ def _pose(table: TextTable, convention: Convention, *, commanded: bool, confirme
     values = np.column_stack([table.numbers(c) for c in columns])
     positions, orientations = values[:, :3], values[:, 3:]
     if not confirmed:
-        unit_checks.require_millimetres(positions, f"{table.path}: {', '.join(columns[:3])}")
         if convention.unit == "deg":
             unit_checks.require_degrees(orientations, f"{table.path}: {', '.join(columns[3:])}")
         if convention.unit == "rad":
             unit_checks.require_radians(orientations, f"{table.path}: {', '.join(columns[3:])}")
+        where = f"{table.path}: {', '.join(columns[:3])}"
+        unit_checks.require_millimetres(positions, where, convention=convention.name)
     try:
         R = rotation_from_convention(orientations, convention.name)
     except InputError as error:
@@ -375,7 +376,7 @@ def _looks_doubtful(poses: PoseSequence, c: Convention) -> bool:
     try:
         for T in (poses.T_MH, poses.T_MH_set):
             if T is not None:
-                unit_checks.require_millimetres(T.t, "")
+                unit_checks.require_millimetres(T.t, "", convention=c.name)
                 if c.unit == "deg":
                     unit_checks.require_degrees(convention_from_rotation(T.R, c.name), "")
         assert poses.alpha is not None

@@ -25,19 +25,22 @@ SMALLEST_PLAN_MM = 0.05
 LARGEST_POSITION_MM = 5000.0
 ONE_TURN = 2 * math.pi
 FEWEST_ROBOT_AXES = 4
+ROBOT_CONVENTIONS = frozenset({"kuka", "fanuc", "yaskawa", "staubli", "abb", "ur", "kawasaki"})
+LARGEST_ROBOT_REACH_M = 5.0
+"""Positions of a robot's table that all stay below this are metres: its base is farther than 5 mm from its tool."""
 
-TABLE_CURE = "if the numbers are right, say so with a line '# units: confirmed' or units_confirmed=True"
+TABLE_REMEDY = "if the numbers are right, say so with a line '# units: confirmed' or units_confirmed=True"
 
 
 def require_degrees(angles: Array, where: str) -> None:
-    """UnitError if orientation angles that should be degrees look like radians, or are no angles."""
+    """UnitError if orientation angles that should be degrees look like radians, or exceed a full turn."""
     largest = _largest(angles)
     if largest > LARGEST_ORIENTATION_DEG:
-        raise UnitError(f"{where}: an angle of {largest:g} is no orientation in degrees; {TABLE_CURE}")
+        raise UnitError(f"{where}: an angle of {largest:g} is not an orientation in degrees; {TABLE_REMEDY}")
     if ENCODER_NOISE_DEG <= largest < SMALLEST_PLAN_DEG or _whole_degrees_in_radians(angles):
         raise UnitError(
             f"{where}: the angles look like radians (largest {largest:g}, which is {math.degrees(largest):.4g} deg "
-            f"if it is rad), but the columns are in degrees; convert them, or {TABLE_CURE}"
+            f"if it is rad), but the columns are in degrees; convert them, or {TABLE_REMEDY}"
         )
 
 
@@ -51,7 +54,7 @@ def require_table_degrees(alpha: Array, where: str) -> None:
     if turn or _whole_degrees_in_radians(alpha):
         raise UnitError(
             f"{where}: the table angles look like radians (largest {largest:g}, which is {math.degrees(largest):.4g} "
-            f"deg if it is rad), but alpha_deg is in degrees; convert them, or {TABLE_CURE}"
+            f"deg if it is rad), but alpha_deg is in degrees; convert them, or {TABLE_REMEDY}"
         )
 
 
@@ -65,7 +68,7 @@ def require_joint_degrees(q: Array, where: str) -> None:
     if _whole_degrees_in_radians(q) or (not few and SMALLEST_PLAN_DEG < largest <= ONE_TURN):
         raise UnitError(
             f"{where}: the joint values look like radians (largest {largest:g}, which is {math.degrees(largest):.4g} "
-            f"deg if it is rad), but the columns are in degrees; convert them, or {TABLE_CURE}"
+            f"deg if it is rad), but the columns are in degrees; convert them, or {TABLE_REMEDY}"
         )
 
 
@@ -75,28 +78,29 @@ def require_radians(angles: Array, where: str) -> None:
     if largest > ONE_TURN * (1 + 1e-6):
         raise UnitError(
             f"{where}: a rotation vector of length {largest:g} is more than one turn in radians; are these degrees? "
-            f"Convert them, or {TABLE_CURE}"
+            f"Convert them, or {TABLE_REMEDY}"
         )
 
 
-def require_millimetres(positions: Array, where: str) -> None:
+def require_millimetres(positions: Array, where: str, *, convention: str = "") -> None:
     """UnitError if positions that should be mm look like metres or micrometres.
 
     Metres: all below 0.05 and not just encoder noise about zero (below 0.005), or all whole half-millimetres if they
-    were metres.  Micrometres: above 5000.
+    were metres; in the convention of a robot's maker, all below 5.  Micrometres: above 5000.
     """
     largest = _largest(positions)
     if largest > LARGEST_POSITION_MM:
         raise UnitError(
             f"{where}: positions look like micrometres (largest {largest:g}, a reach of {largest / 1000:.3g} m if it "
-            f"is mm); convert them, or {TABLE_CURE}"
+            f"is mm); convert them, or {TABLE_REMEDY}"
         )
     halves = positions * 2000.0
     typed = bool(np.all(np.abs(halves - np.round(halves)) < 1e-6))
-    if ENCODER_NOISE_MM <= largest < SMALLEST_PLAN_MM or (0 < largest < ENCODER_NOISE_MM and typed):
+    least = LARGEST_ROBOT_REACH_M if convention in ROBOT_CONVENTIONS else SMALLEST_PLAN_MM
+    if ENCODER_NOISE_MM <= largest < least or (0 < largest < ENCODER_NOISE_MM and typed):
         raise UnitError(
             f"{where}: positions look like metres (largest {largest:g}, which is {largest * 1000:g} mm if it is m), "
-            f"but the columns are in millimetres; convert them, or {TABLE_CURE}"
+            f"but the columns are in millimetres; convert them, or {TABLE_REMEDY}"
         )
 
 
