@@ -7,8 +7,13 @@ light.
 
 from __future__ import annotations
 
+from pathlib import Path as _Path
+
 import lazy_loader
 
+from tomopose.kernel_cache import choose_cache_folder as _choose_cache_folder
+
+_choose_cache_folder(_Path(__file__).parent)
 _load, _, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 

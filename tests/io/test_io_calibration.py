@@ -237,8 +237,8 @@ def change(path: Path, **changes: object) -> None:
         ({"p_u": -0.1}, InputError, "a positive pitch is needed"),
         ({"P": np.zeros((2, 3))}, InputError, r"\(n, 3, 4\)"),
         ({"pose_id": np.array(["a"])}, InputError, "56 matrices but 1 pose ids"),
-        ({"scanner": "{"}, FileError, "damaged"),
-        ({"scanner": "5"}, FileError, "damaged"),
+        ({"scanner": "{"}, FileError, "scanner is no JSON"),
+        ({"scanner": "5"}, FileError, "no readable matrices.npz|damaged"),
         ({"scanner": "{}"}, InputError, "scanner: d_SD_mm, .* missing"),
         ({"n_u": np.array([1, 2])}, FileError, "damaged"),
     ],
@@ -255,10 +255,10 @@ def test_files_that_are_no_matrices_are_refused(tmp_path, matrices):
     with pytest.raises(FileError, match="does not exist"):
         read_matrices(tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("no archive")
-    with pytest.raises(FileError, match=r"is no matrices.npz"):
+    with pytest.raises(FileError, match=r"is no readable matrices.npz"):
         read_matrices(tmp_path / "text.npz")
     (tmp_path / "empty.npz").write_bytes(b"")
-    with pytest.raises(FileError, match=r"is no matrices.npz"):
+    with pytest.raises(FileError, match=r"is no readable matrices.npz"):
         read_matrices(tmp_path / "empty.npz")
     np.savez(tmp_path / "pickled.npz", P=np.array([{}], dtype=object))
     with pytest.raises(FileError, match="allow_pickle"):
@@ -268,5 +268,5 @@ def test_files_that_are_no_matrices_are_refused(tmp_path, matrices):
         write_matrices(tmp_path / "m.npz", matrices)
     whole = (tmp_path / "m.npz").read_bytes()
     (tmp_path / "half.npz").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(FileError, match=r"is no matrices.npz"):
+    with pytest.raises(FileError, match=r"is no readable matrices.npz"):
         read_matrices(tmp_path / "half.npz")

@@ -400,7 +400,7 @@ def test_a_clock_that_runs_backwards_gives_a_warning(table):
 def test_files_that_are_no_tables_are_refused(table, tmp_path):
     with pytest.raises(FileError, match="does not exist"):
         read_poses(tmp_path / "none.csv")
-    with pytest.raises(FileError, match="cannot be read"):
+    with pytest.raises(FileError, match="is a folder; a pose table is needed"):
         read_poses(tmp_path)
     with pytest.raises(InputError, match="no header line"):
         read_poses(table(""))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
+import io
 import json
 import sys
 import time
@@ -14,6 +16,8 @@ from typing import Annotated, Any
 import typer
 
 OK, BAD_INPUT, USAGE, NOT_TRUSTWORTHY, MISSING, INTERNAL = 0, 1, 2, 3, 4, 70
+INTERRUPTED, TERMINATED = 130, 143
+"""As shells say it: 128 and the signal's number."""
 
 Progress = Callable[[int, int], None]
 
@@ -45,6 +49,37 @@ DaskOption = Annotated[str | None, typer.Option("--dask", help="Address of a das
 BallOption = Annotated[float, typer.Option("--ball-diameter-mm", help="Nominal diameter of the ball, mm.")]
 
 
+IN_ASCII = {"µ": "u", "−": "-", "–": "-", "×": "x", "°": " deg", "±": "+-", "σ": "sigma", "²": "2", "…": "..."}
+"""How a terminal without these characters shows them."""
+
+
+def _shown_otherwise(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    part = error.object[error.start : error.end]
+    return "".join(IN_ASCII.get(c, "?") for c in part), error.end
+
+
+def speak_any_terminal() -> None:
+    """Text that the terminal's encoding does not have is shown by other characters, never as an error."""
+    codecs.register_error("tomopose", _shown_otherwise)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="tomopose")
+
+
+def tell(text: str) -> None:
+    """A line for people on standard error; where nobody listens any more, the work goes on."""
+    with contextlib.suppress(OSError, ValueError):
+        print(text, file=sys.stderr, flush=True)
+
+
+def as_line(document: Mapping[str, Any]) -> str:
+    """JSON in one line, in characters that standard output has."""
+    unicode = (sys.stdout.encoding or "").lower().replace("-", "").startswith("utf")
+    return json.dumps(document, ensure_ascii=not unicode, allow_nan=False)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Say:
     """How a verb speaks: results to standard output, notes and progress to standard error."""
@@ -54,14 +89,14 @@ class Say:
 
     def note(self, text: str) -> None:
         if not self.quiet and not self.json:
-            print(text, file=sys.stderr)
+            tell(text)
 
     def result(self, summary: Mapping[str, Any], lines: Sequence[str] = ()) -> None:
         """The summary as JSON, or its lines for people."""
         from tomopose.files import plain
 
         if self.json:
-            print(json.dumps(plain(summary), ensure_ascii=False, allow_nan=False))
+            print(as_line(plain(summary)))
         elif not self.quiet:
             for line in lines:
                 print(line)
@@ -106,7 +141,7 @@ def _lines(label: str) -> Progress:
             said = tenth
             elapsed = time.monotonic() - start
             left = f", {elapsed * (total - done) / done:.0f} s left" if 0 < done < total else ""
-            print(f"{label}: {done} of {total}{left}", file=sys.stderr, flush=True)
+            tell(f"{label}: {done} of {total}{left}")
 
     return update
 

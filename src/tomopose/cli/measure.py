@@ -83,9 +83,10 @@ def measure(
     """
     from dataclasses import replace
 
-    from tomopose.files import require_absent
+    from tomopose.files import atomic_folder, require_absent
     from tomopose.io.volume_files import read_volume
     from tomopose.measurement.measure import measure as carry_out
+    from tomopose.measurement.mesh.comparison_files import FILES
     from tomopose.measurement.plan import read_plan
     from tomopose.measurement.results import write_results
     from tomopose.provenance import provenance
@@ -102,8 +103,8 @@ def measure(
     if bool(calibration) != bool(poses):
         say.note("--calibration and --poses belong together")
         return USAGE
-    page = require_absent(out / "report.html", force=force)
-    require_absent(out / "measurement.json", force=force)
+    for name in ("report.html", "measurement.json"):
+        require_absent(out / name, force=force)
     wanted = read_plan(plan)
     files = named_files(volume, "volume")
     mesh = None if reference is None else reference_of(reference, edge_mm, probed, between)
@@ -143,14 +144,16 @@ def measure(
             )
         results = replace(results, simulated=drawn)
     comparisons = {}
-    if mesh is not None:
-        for name, one in volumes.items():
-            comparisons[name] = compared(one, mesh, results.alignments[name], fit=fit, search_mm=search_mm)
-            write_comparison_to(
-                out / name if len(volumes) > 1 else out, comparisons[name], range_um / 1000, name, force=force
-            )
-    write_results(results, out, force=force)
-    write_report(page, measurement_report(results, comparisons=comparisons, range_mm=range_um / 1000))
+    old = (*FILES, "comparison.png", "report.html", "measurement.json", "measurement.csv", "uncertainty.csv")
+    with atomic_folder(out, force=force, stale=old) as folder:
+        if mesh is not None:
+            for name, one in volumes.items():
+                comparisons[name] = compared(one, mesh, results.alignments[name], fit=fit, search_mm=search_mm)
+                place = folder / name if len(volumes) > 1 else folder
+                write_comparison_to(place, comparisons[name], range_um / 1000, name)
+        write_results(results, folder, force=True)
+        page = measurement_report(results, comparisons=comparisons, range_mm=range_um / 1000)
+        write_report(folder / "report.html", page)
     say.result(*told(out, results, comparisons))
     return OK
 
@@ -181,15 +184,14 @@ def compared(volume: Any, mesh: Any, alignment: Any, *, fit: str, search_mm: flo
     )
 
 
-def write_comparison_to(folder: Path, comparison: Any, range_mm: float, name: str, *, force: bool) -> None:
-    """Mesh files, tables and the picture of one comparison."""
-    from tomopose.files import atomic_file, require_absent
+def write_comparison_to(folder: Path, comparison: Any, range_mm: float, name: str) -> None:
+    """Mesh files, tables and the picture of one comparison, into a folder that is being made."""
+    from tomopose.files import atomic_file
     from tomopose.measurement.mesh.comparison_files import write_comparison
     from tomopose.report.figures.measurement_png import comparison_png
 
-    picture = require_absent(folder / "comparison.png", force=force)
-    write_comparison(comparison, folder, range_mm=range_mm, force=force)
-    with atomic_file(picture) as temporary:
+    write_comparison(comparison, folder, range_mm=range_mm, force=True)
+    with atomic_file(folder / "comparison.png") as temporary:
         temporary.write_bytes(comparison_png(comparison, range_mm=range_mm, title=name))
 
 

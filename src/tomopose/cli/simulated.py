@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -68,6 +68,28 @@ def write_run(
     truth.json holds the run's key.  Images that are there already stay only where it is this run's (`resume`); those of
     another run are removed before anything of this one is written, so that the folder never mixes two.
     """
+    from tomopose.atomic import only_writer
+
+    with only_writer(out):
+        _write_run(
+            out, run, inputs=inputs, form=form, workers=workers, client=client, resume=resume, force=force,
+            told=progress or (lambda finished, n: None),
+        )  # fmt: skip
+
+
+def _write_run(
+    out: Path,
+    run: Any,
+    *,
+    inputs: Iterable[Path],
+    form: str,
+    workers: int,
+    client: Any,
+    resume: bool,
+    force: bool,
+    told: Progress,
+) -> None:
+    """As `write_run`, once no other process writes the folder."""
     import tomopose as tp
     from tomopose.files import require_absent, write_json
     from tomopose.io.images.stack import append_hdf5, frames_kept
@@ -88,22 +110,18 @@ def write_run(
     made = provenance(inputs=inputs, seed=run.seed)
     write_json(tables[2], "truth", {**run.truth(), "key": key.to_json(), "provenance": made.to_json()})
 
-    def told(finished: int) -> None:
-        if progress is not None:
-            progress(finished, n)
-
     if form == "hdf5":
         whole = resume and stack.exists()
         kept = n if whole else frames_kept(stack, key) if resume else 0
-        told(kept)
+        told(kept, n)
         if not whole:
             made_now = frames(run, range(kept, n), workers=workers, client=client)
-            append_hdf5(stack, _told(made_now, kept, told), count=n, key=key, rows=rows, kept=kept)
+            append_hdf5(stack, _told(made_now, kept, n, told), count=n, key=key, rows=rows, kept=kept)
         return
     missing = [k for k, path in enumerate(paths) if not (resume and path.exists())]
     done = n - len(missing)
-    told(done)
-    for k, image in _told(frames(run, missing, workers=workers, client=client), done, told):
+    told(done, n)
+    for k, image in _told(frames(run, missing, workers=workers, client=client), done, n, told):
         tp.write_tiff(paths[k], image, rows=rows, force=True)
 
 
@@ -139,8 +157,8 @@ def clear_another_run(out: Path, key: Key, *, force: bool) -> None:
     remove_stack(stack)
 
 
-def _told(made: Iterator[tuple[int, Any]], done: int, told: Callable[[int], None]) -> Iterator[tuple[int, Any]]:
+def _told(made: Iterator[tuple[int, Any]], done: int, n: int, told: Progress) -> Iterator[tuple[int, Any]]:
     """The same frames; each is told of once the next is asked for, when it is written."""
     for finished, frame in enumerate(made, start=done + 1):
         yield frame
-        told(finished)
+        told(finished, n)

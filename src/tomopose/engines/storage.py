@@ -8,8 +8,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from tomopose.errors import FileError
 from tomopose.files import atomic_file
+from tomopose.reading import reading
+from tomopose.reading.memory import require_memory
 
 PIECE = 64 * 2**20
 """Bytes written at a time; a volume is often a strided view, and writing it whole would copy it whole."""
@@ -35,13 +36,11 @@ def store(path: Path, values: np.ndarray) -> None:
 
 def mapped(path: str | Path, name: str = "volume") -> np.ndarray:
     """The dataset as a read-only memory map: nothing is read before it is used."""
-    try:
-        with h5py.File(path, "r") as file:
-            dataset = file[name]
-            offset, shape, kind = dataset.id.get_offset(), dataset.shape, dataset.dtype
-            if offset is None:
-                values: np.ndarray = dataset[()]
-                return values
-    except (OSError, KeyError) as error:
-        raise FileError(f"{path} holds no readable dataset {name!r}: {error}", path=path) from error
+    with reading(path, "volume"), h5py.File(path, "r") as file:
+        dataset = file[name]
+        offset, shape, kind = dataset.id.get_offset(), dataset.shape, dataset.dtype
+        if offset is None:
+            require_memory(path, f"{name} of shape {shape}", dataset.nbytes)
+            values: np.ndarray = dataset[()]
+            return values
     return np.memmap(path, dtype=kind, mode="r", offset=offset, shape=shape)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tomopose.errors import InputError, NotRepresentableError
+from tomopose.errors import FileError, InputError, NotRepresentableError
 from tomopose.exports.astra import to_astra
 from tomopose.exports.cera import TABLE_NAME, to_cera
 from tomopose.exports.cil import to_cil
@@ -21,7 +21,7 @@ from tomopose.exports.panel import Rows, check_rows
 from tomopose.exports.pyronn import to_pyronn
 from tomopose.exports.rtk import to_rtk
 from tomopose.exports.tigre import to_tigre
-from tomopose.files import atomic_folder, plain, write_json
+from tomopose.files import atomic_folder, plain, read_json, write_json
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.provenance import Provenance, provenance, sha256
 
@@ -193,7 +193,7 @@ def export(
     entries: dict[str, Any] = {}
     refused: dict[str, str] = {}
     made = provenance(arguments={"formats": names, "rows": rows})
-    with atomic_folder(out, force=force) as folder:
+    with atomic_folder(out, force=force, stale=_files_of(out) if force else ()) as folder:
         for name in names:
             try:
                 files[name] = tuple(FORMATS[name].write(folder, matrices, rows))
@@ -205,6 +205,17 @@ def export(
             entries[name] = _entry(FORMATS[name], folder, files[name], matrices, rows)
         write_json(folder / MANIFEST, "exports", _manifest(matrices, entries, refused, made))
     return Exported(folder=out, files=files, refused=refused, provenance=made)
+
+
+def _files_of(out: Path) -> set[str]:
+    """The files that an earlier export into this folder made; empty where its manifest cannot be read."""
+    try:
+        formats = read_json(out / MANIFEST, "exports").get("formats")
+    except FileError:
+        return set()
+    entries = formats.values() if isinstance(formats, Mapping) else ()
+    files = [e["files"] for e in entries if isinstance(e, Mapping) and isinstance(e.get("files"), Mapping)]
+    return {str(name) for names in files for name in names if Path(str(name)).name == name}
 
 
 def _named(formats: Sequence[str] | str) -> list[str]:

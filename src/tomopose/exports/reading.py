@@ -7,15 +7,14 @@ the format does not hold them; a missing one is an error that names the option, 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PureWindowsPath
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
-from tomopose.errors import ConventionError, FileError, InputError
+from tomopose.errors import ConventionError, FileError, InputError, SchemaVersionError
 from tomopose.exports.astra import from_astra
 from tomopose.exports.cera import cera_config, from_cera
 from tomopose.exports.cil import from_cil
@@ -30,8 +29,11 @@ from tomopose.exports.tigre import from_tigre
 from tomopose.files import read_json
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.provenance import sha256
+from tomopose.reading import parse_json, read_text, reader, reading, require_file, require_inside
+from tomopose.reading.arrays import MAGIC, ZIP_MAGIC, read_npy, read_npz
 
 
+@reader("geometry file", folder=True)
 def read_geometry(
     path: Path | str,
     *,
@@ -75,6 +77,7 @@ def read_geometry(
         given = _filled(given, record, path, format)
     if side is None and record is not None and "rtk.json" in record.siblings:
         side = path.parent / "rtk.json"
+        require_described(side, record.manifest["formats"][record.format]["files"]["rtk.json"])
     content = _load(path)
     found = _format_of(content)
     if format is not None and found is not None and format != found:
@@ -105,31 +108,15 @@ _FROM: Mapping[str, Callable[..., ProjectionMatrices]] = {
 
 def _load(path: Path) -> Any:
     """Content by the file's first bytes: an array, a mapping of arrays, a JSON object or text."""
-    try:
-        with open(path, "rb") as stream:
-            head = stream.read(6)
-            stream.seek(0)
-            if head == b"\x93NUMPY" or head[:4] == b"PK\x03\x04":
-                return _arrays(stream, path)
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror or error}", path=path) from error
-    except UnicodeDecodeError as error:
-        raise FileError(f"{path} is damaged or of another kind: {error}", path=path) from error
-    if not text.lstrip().startswith("{"):
-        return text
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError as error:
-        raise FileError(f"{path} is no whole JSON: {error}; is the file truncated?", path=path) from error
-
-
-def _arrays(stream: BinaryIO, path: Path) -> Any:
-    try:
-        loaded = np.load(stream, allow_pickle=False)
-        return loaded if isinstance(loaded, np.ndarray) else {key: loaded[key] for key in loaded.files}
-    except Exception as error:  # what NumPy's and zip's parsers raise on damaged bytes has no common class
-        raise FileError(f"{path} is damaged: {error}", path=path) from error
+    require_file(path, "geometry file")
+    with reading(path, "geometry file"), open(path, "rb") as stream:
+        head = stream.read(6)
+    if head == MAGIC:
+        return read_npy(path, "geometry file")
+    if head[:4] == ZIP_MAGIC:
+        return read_npz(path, "geometry file")
+    text = read_text(path)
+    return parse_json(text, path, constants=True) if text.lstrip().startswith("{") else text
 
 
 def _format_of(content: Any) -> str | None:
@@ -180,7 +167,8 @@ def _read_cera(content: Any, given: Given, path: Path) -> ProjectionMatrices:
     if content.startswith("projtable.txt"):
         return from_cera(content, given, where=str(path))
     # The names in a .config come from Windows: both kinds of separators occur.
-    table = path.parent / PureWindowsPath(cera_config(content, where=str(path))[1]).as_posix()
+    name = PureWindowsPath(cera_config(content, where=str(path))[1])
+    table = require_inside(path.parent, name.name if name.anchor else str(name), str(path))
     if not table.is_file():
         raise FileError(f"{path} names the table {table.name}, but {table} does not exist", path=table)
     return from_cera(_read_text(table), given, config=content, where=str(path))
@@ -196,21 +184,52 @@ class _Record:
     siblings: frozenset[str]
 
 
+def _manifest(folder: Path) -> Mapping[str, Any]:
+    """The manifest of an export folder, its parts of the right kinds; FileError where it is damaged."""
+    path = folder / MANIFEST
+    manifest = read_json(path, "exports")
+    formats, names = manifest.get("formats"), manifest.get("pose_id", [])
+    if not isinstance(formats, Mapping) or not isinstance(names, list):
+        raise FileError(f"{path} is damaged: formats is no object, or pose_id no list", path=path)
+    for format, entry in formats.items():
+        files = entry.get("files") if isinstance(entry, Mapping) else None
+        if not isinstance(files, Mapping) or not files or not all(isinstance(f, str) for f in files.values()):
+            raise FileError(f"{path} is damaged: format {format!r} names no files with their SHA-256", path=path)
+        for name in files:
+            require_inside(folder, name, str(path))
+    return manifest
+
+
 def _record_of(path: Path) -> _Record | None:
-    """The manifest's entry for this very file (same name and SHA-256), or None."""
+    """The manifest's entry for this very file, or None where no manifest beside it names it.
+
+    FileError where the manifest names it with another SHA-256: the file was changed, or belongs to another export.
+    """
     manifest_path = path.parent / MANIFEST
     if not manifest_path.is_file():
         return None
     try:
-        manifest = read_json(manifest_path, "exports")
-    except FileError:
+        manifest = _manifest(path.parent)
+    except SchemaVersionError:
         return None  # another program's manifest.json: it says nothing about this file
-    for name, entry in manifest.get("formats", {}).items():
-        if entry.get("files", {}).get(path.name) == sha256(path):
+    for name, entry in manifest["formats"].items():
+        if path.name in entry["files"]:
+            require_described(path, entry["files"][path.name])
             return _Record(
                 manifest=manifest, format=name, row0=entry.get("row0", "bottom"), siblings=frozenset(entry["files"])
             )
     return None
+
+
+def require_described(path: Path, digest: str) -> None:
+    """FileError unless the file has the SHA-256 that the manifest beside it says."""
+    require_file(path, "file of an export")
+    if sha256(path) != digest:
+        raise FileError(
+            f"{path} is not the file that {MANIFEST} beside it describes (its SHA-256 differs): it was edited, or an "
+            "export was interrupted; export again, or move the file to another folder if it is meant as it is",
+            path=path,
+        )
 
 
 def _filled(given: Given, record: _Record, path: Path, format: str | None) -> Given:
@@ -227,14 +246,13 @@ def _filled(given: Given, record: _Record, path: Path, format: str | None) -> Gi
 
 def _file_of_export(folder: Path, format: str | None) -> tuple[Path, str]:
     """The file of an export folder that holds the geometry in that format, or in its first one."""
-    manifest = read_json(folder / MANIFEST, "exports")
-    formats = manifest.get("formats", {})
+    formats = _manifest(folder)["formats"]
     name = format or next(iter(formats), "")
     if name not in formats:
         raise InputError(f"{folder} holds no format {name!r}; it holds {', '.join(formats) or 'none'}")
     path = folder / next(iter(formats[name]["files"]))
     if not path.is_file():
         raise FileError(f"{folder / MANIFEST} names {path.name}, but it does not exist", path=path)
-    if _record_of(path) is None:
-        raise FileError(f"{path} is not the file that {MANIFEST} describes (its SHA-256 differs)", path=path)
+    for sibling, digest in formats[name]["files"].items():
+        require_described(folder / sibling, digest)
     return path, name

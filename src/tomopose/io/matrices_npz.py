@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,8 @@ from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.io.scanner_json import scanner_document, scanner_from_document
 from tomopose.io.table_text import unknown_column
 from tomopose.provenance import Provenance
+from tomopose.reading import parse_json, reader
+from tomopose.reading.arrays import read_npz
 
 REQUIRED = ("P", "n_u", "n_v", "p_u", "p_v", "pose_id")
 SIGMA = {"P_points_sigma_px": "points_sigma", "P_points_sigma_shared_px": "points_sigma_shared"}
@@ -46,6 +47,7 @@ def write_matrices(
         np.savez(stream, **content)
 
 
+@reader("matrices.npz")
 def read_matrices(path: str | Path) -> ProjectionMatrices:
     """Read matrices.npz.
 
@@ -68,7 +70,7 @@ def read_matrices(path: str | Path) -> ProjectionMatrices:
     try:
         scanner = None
         if "scanner" in content:
-            scanner = scanner_from_document(json.loads(str(content["scanner"])), "scanner")
+            scanner = scanner_from_document(parse_json(str(content["scanner"]), f"{path}: scanner"), "scanner")
         return ProjectionMatrices(
             P=content["P"],
             n_u=int(content["n_u"]),
@@ -86,17 +88,14 @@ def read_matrices(path: str | Path) -> ProjectionMatrices:
         raise FileError(f"{path} is damaged: {error}", path=path) from error
 
 
+@reader("matrices.npz")
 def read_matrices_provenance(path: str | Path) -> Provenance | None:
     """The provenance that stands in matrices.npz, or None."""
     content = _load(Path(path))
-    return Provenance.from_json(json.loads(str(content["provenance"]))) if "provenance" in content else None
+    if "provenance" not in content:
+        return None
+    return Provenance.from_json(parse_json(str(content["provenance"]), f"{path}: provenance"))
 
 
 def _load(path: Path) -> dict[str, Any]:
-    try:
-        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
-    except FileNotFoundError as error:
-        raise FileError(f"{path} does not exist", path=path) from error
-    except (OSError, ValueError, AttributeError, zipfile.BadZipFile, EOFError) as error:
-        raise FileError(f"{path} is no matrices.npz: {error}", path=path) from error
+    return dict(read_npz(path, "matrices.npz"))

@@ -15,6 +15,7 @@ from tomopose.errors import InputError, UnitError
 from tomopose.files import require_absent, write_text
 from tomopose.io.table_text import TextTable, format_table, read_table, unknown_column
 from tomopose.observations import BallObservations
+from tomopose.reading import reader
 from tomopose.units import Array
 
 REQUIRED = ("pose_id", "u_px", "v_px", "sigma_u_px", "sigma_v_px")
@@ -26,6 +27,7 @@ YES, NO = ("1", "true", "yes"), ("0", "false", "no")
 LONG = Context(prec=40)
 
 
+@reader("table of observations")
 def read_observations(path: str | Path) -> BallObservations:
     """Read observations.csv.  Rows whose `seen` is 0 may have blank u, v and sigma; without that column all are seen.
 

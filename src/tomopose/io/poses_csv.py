@@ -28,6 +28,7 @@ from tomopose.io import unit_checks
 from tomopose.io.notices import InputWarning
 from tomopose.io.table_text import TextTable, format_table, read_table, unknown_column
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.reading import reader
 from tomopose.units import Array
 
 POSITION = ("x_mm", "y_mm", "z_mm")
@@ -50,6 +51,7 @@ def pose_columns(convention: Convention, *, commanded: bool = False) -> tuple[st
     return tuple(set_name(c) for c in names) if commanded else names
 
 
+@reader("pose table")
 def read_poses(
     path: str | Path,
     *,

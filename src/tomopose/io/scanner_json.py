@@ -13,6 +13,7 @@ from tomopose.errors import InputError, UnitError
 from tomopose.files import read_json, require_absent, write_json
 from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 from tomopose.io.table_text import unknown_column
+from tomopose.reading import reader
 
 REQUIRED = ("d_SD", "d_SR", "p_u", "p_v", "u_0", "v_0")
 COUNTS = ("n_u", "n_v")
@@ -30,6 +31,7 @@ DISTANCE_RANGE = (5.0, 1.0e5)
 CURE = 'if it is right, say so with "units": "confirmed"'
 
 
+@reader("scanner.json")
 def read_scanner(path: str | Path) -> Scanner:
     """Read scanner.json.  Raises InputError or UnitError by key, FileError, SchemaVersionError."""
     return scanner_from_document(read_json(path, "scanner"), str(path))

@@ -18,8 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tomopose.errors import FileError, InputError
+from tomopose.errors import InputError
 from tomopose.io.notices import InputWarning
+from tomopose.reading import read_text, reader
 from tomopose.units import Array
 
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -28,6 +29,8 @@ NUMPY_REPR = re.compile(r"np\.float64\((?P<number>.*)\)")
 """What repr() of a NumPy 2 scalar leaves in tables written by scripts; the number in it is exact."""
 PLACEHOLDER = re.compile(r"[+-]?9{4,}(\.9*0*)?")
 """9999, -99999, 9999.9 ...: how controllers and spreadsheets write "no value"."""
+LONGEST_LINE, LONGEST_CELL = 100_000, 2000
+"""Characters; the longest cell of a sound table is a file name or a reason in words."""
 COMMENT = re.compile(r"#\s*(?P<key>[A-Za-z][A-Za-z0-9_ -]*?)\s*:\s*(?P<value>.*?)\s*$")
 
 
@@ -93,23 +96,7 @@ class TextTable:
         return value
 
 
-def read_text(path: str | Path) -> str:
-    """The text of a UTF-8 file without its byte order mark; FileError where it cannot be read."""
-    path = Path(path)
-    try:
-        raw = path.read_bytes()
-    except FileNotFoundError as error:
-        raise FileError(f"{path} does not exist", path=path) from error
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror or error}", path=path) from error
-    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        raise FileError(f"{path} is UTF-16 text; save it as UTF-8 (in a spreadsheet: CSV UTF-8)", path=path)
-    try:
-        return raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise FileError(f"{path} is no UTF-8 text (byte {error.start}); save it as UTF-8", path=path) from error
-
-
+@reader("table")
 def read_table(path: str | Path) -> TextTable:
     """Read a table.  Blank lines are skipped; a comment key that returns with another value is refused."""
     path = Path(path)
@@ -126,7 +113,7 @@ def read_table(path: str | Path) -> TextTable:
             continue
         if header is None:
             separator = next((s for s in "\t;" if s in line), ",")
-        cells = tuple(cell.strip() for cell in next(csv.reader([line], delimiter=separator)))
+        cells = _cells(line, separator, path, number)
         if header is None:
             header = cells
         elif len(cells) != len(header):
@@ -150,6 +137,17 @@ def read_table(path: str | Path) -> TextTable:
         lines=tuple(lines),
         decimal_comma=_has_decimal_commas(path, separator, rows),
     )
+
+
+def _cells(line: str, separator: str, path: Path, number: int) -> tuple[str, ...]:
+    """The cells of a line; InputError where line or cell are too long to be a table's."""
+    if len(line) > LONGEST_LINE:
+        raise InputError(f"{path}: line {number} has {len(line)} characters; no table has lines like that")
+    cells = tuple(cell.strip() for cell in next(csv.reader([line], delimiter=separator)))
+    longest = max(map(len, cells))
+    if longest > LONGEST_CELL:
+        raise InputError(f"{path}: line {number} has a cell of {longest} characters; at most {LONGEST_CELL} are read")
+    return cells
 
 
 def _add_comment(comments: dict[str, str], line: str, path: Path, number: int) -> None:

@@ -7,6 +7,7 @@ The TIFF and the two raw formats carry spacing and the centre of voxel (0, 0, 0)
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,11 @@ import tifffile
 from tomopose.engines.storage import mapped, pieces, write_layers
 from tomopose.errors import FileError, SchemaVersionError
 from tomopose.files import atomic_file, plain, require_absent
+from tomopose.io.images.tiff_structure import require_sound_tiff
 from tomopose.provenance import Provenance
+from tomopose.reading import parse_json, read_text, reader, require_file, require_inside
+from tomopose.reading.hdf5 import checked_hdf5
+from tomopose.reading.memory import require_memory
 from tomopose.volume import Volume, VoxelGrid
 
 SCHEMA = "tomopose/volume/1"
@@ -47,27 +52,23 @@ def write_volume(volume: Volume, path: str | Path, *, force: bool = False) -> Pa
     return path
 
 
+@reader("volume")
 def read_volume(path: str | Path) -> Volume:
     """Read a volume that `write_volume` wrote.  The values are mapped from the file where it allows that.
 
     Raises FileError where the file is missing, of another suffix or damaged, SchemaVersionError for another schema.
     """
     path = Path(path)
-    reader = {
+    read = {
         ".h5": _read_hdf5,
         ".tif": _read_tiff,
         ".tiff": _read_tiff,
         ".nrrd": _read_nrrd,
         ".mhd": _read_metaimage,
     }.get(path.suffix.lower())
-    if reader is None:
+    if read is None:
         raise FileError(f"{path}: {path.suffix!r} is no volume format; {', '.join(SUFFIXES)} are known", path=path)
-    if not path.is_file():
-        raise FileError(f"{path} does not exist", path=path)
-    try:
-        return reader(path)
-    except (OSError, KeyError, ValueError, tifffile.TiffFileError) as error:
-        raise FileError(f"{path} is no readable volume: {error}", path=path) from error
+    return read(path)
 
 
 def _grid(shape: Any, spacing: Any, origin: Any) -> VoxelGrid:
@@ -100,11 +101,13 @@ def _write_hdf5(volume: Volume, path: Path) -> None:
 
 
 def _read_hdf5(path: Path) -> Volume:
-    with h5py.File(path, "r") as file:
+    with h5py.File(checked_hdf5(path), "r") as file:
         schema = str(file.attrs.get("schema", ""))
         if schema != SCHEMA:
             raise SchemaVersionError(f"{path}: schema is {schema!r}; {SCHEMA!r} is needed", path=path)
         dataset = file["volume"]
+        if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 3 or dataset.dtype.kind not in "fiu":
+            raise FileError(f"{path}: volume is no array [z, y, x] of numbers", path=path)
         if dataset.attrs["frame"] != "W" or dataset.attrs["axes"] != "z,y,x":
             raise FileError(
                 f"{path}: frame {dataset.attrs['frame']!r} and axes {dataset.attrs['axes']!r}; 'W' and 'z,y,x' are "
@@ -113,14 +116,18 @@ def _read_hdf5(path: Path) -> Volume:
             )
         grid = _grid(dataset.shape, dataset.attrs["spacing_mm"], dataset.attrs["origin_mm"])
         residual = file["view_residual"][()] if "view_residual" in file else None
-        notes, settings = json.loads(file.attrs["notes"]), json.loads(file.attrs["settings"])
-        block = json.loads(file.attrs["provenance"]) if "provenance" in file.attrs else None
+        said = {
+            key: parse_json(str(file.attrs[key]), f"{path}: {key}")
+            for key in ("notes", "settings", "provenance")
+            if key in file.attrs
+        }
+    block = said.get("provenance")
     return Volume(
         values=mapped(path),
         grid=grid,
         view_residual=residual,
-        notes=tuple(notes),
-        settings=settings,
+        notes=tuple(said["notes"]),
+        settings=said["settings"],
         provenance=None if block is None else Provenance.from_json(block),
     )
 
@@ -155,11 +162,14 @@ def _write_tiff(volume: Volume, path: Path) -> None:
 
 
 def _read_tiff(path: Path) -> Volume:
+    require_sound_tiff(path)
     with tifffile.TiffFile(path) as file:
         first = file.pages[0]
-        description = json.loads(getattr(first, "description", "") or "{}")
+        description = parse_json(getattr(first, "description", "") or "{}", f"{path}: the first page's description")
         if description.get("schema") != SCHEMA:
             raise SchemaVersionError(f"{path}: the first page does not say {SCHEMA!r}", path=path)
+        layer = math.prod(first.shape) * np.dtype(first.dtype).itemsize
+        require_memory(path, f"{len(file.pages)} layers", len(file.pages) * layer)
         values = np.stack([page.asarray() for page in file.pages])
     return Volume(values=values, grid=_grid(values.shape, description["spacing_mm"], description["origin_mm"]))
 
@@ -174,6 +184,15 @@ def _numbers(values: Any) -> list[str]:
 def _write_raw(stream: Any, values: np.ndarray) -> None:
     for part in pieces((values.shape[0], values.shape[1], values.shape[2])):
         stream.write(np.ascontiguousarray(values[part], dtype="<f4").tobytes())
+
+
+def _mapped_raw(path: Path, offset: int, shape: tuple[int, int, int]) -> np.ndarray:
+    """Float32 values that lie in a file behind `offset` bytes, as many as the shape says."""
+    require_file(path, "raw volume")
+    there = path.stat().st_size - offset
+    if min(shape) < 1 or 4 * math.prod(shape) != there:
+        raise FileError(f"{path}: {' x '.join(map(str, shape[::-1]))} voxels do not fit its {there} bytes", path=path)
+    return np.memmap(path, dtype="<f4", mode="r", offset=offset, shape=shape)
 
 
 def _write_nrrd(volume: Volume, path: Path) -> None:
@@ -217,7 +236,7 @@ def _read_nrrd(path: Path) -> Volume:
     if (directions != np.diag(np.diag(directions))).any():
         raise FileError(f"{path}: the axes are not those of W", path=path)
     origin = [float(x) for x in fields["space origin"].strip("()").split(",")]
-    values = np.memmap(path, dtype="<f4", mode="r", offset=len(text) + 2, shape=(n_z, n_y, n_x))
+    values = _mapped_raw(path, len(text) + 2, (n_z, n_y, n_x))
     return Volume(values=values, grid=_grid(values.shape, np.diag(directions), origin))
 
 
@@ -247,10 +266,10 @@ def _write_metaimage(volume: Volume, path: Path) -> None:
 
 
 def _read_metaimage(path: Path) -> Volume:
-    fields = dict(line.split(" = ", 1) for line in path.read_text(encoding="ascii").splitlines() if " = " in line)
+    fields = dict(line.split(" = ", 1) for line in read_text(path).splitlines() if " = " in line)
     if fields.get("ElementType") != "MET_FLOAT" or fields.get("BinaryDataByteOrderMSB") != "False":
         raise FileError(f"{path}: only little-endian MET_FLOAT files are read", path=path)
     n_x, n_y, n_z = (int(n) for n in fields["DimSize"].split())
-    values = np.memmap(path.parent / fields["ElementDataFile"], dtype="<f4", mode="r", shape=(n_z, n_y, n_x))
+    values = _mapped_raw(require_inside(path.parent, fields["ElementDataFile"], str(path)), 0, (n_z, n_y, n_x))
     spacing, origin = ([float(x) for x in fields[k].split()] for k in ("ElementSpacing", "Offset"))
     return Volume(values=values, grid=_grid(values.shape, spacing, origin))

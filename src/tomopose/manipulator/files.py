@@ -14,6 +14,7 @@ from tomopose.manipulator.hexapod import Hexapod
 from tomopose.manipulator.real_poses import Repeatability
 from tomopose.manipulator.serial import ERRORS, Joint, JointKind, SerialRobot
 from tomopose.provenance import Provenance
+from tomopose.reading import reader
 from tomopose.units import Array
 
 SMALLEST_PLATE_MM, LARGEST_PLATE_MM = 5.0, 5000.0
@@ -55,6 +56,7 @@ SERIAL_KEYS = (
 JOINT_KEYS = ("a_mm", "alpha_deg", "d_mm", "theta_offset_deg", "kind", "sigma", "name")
 
 
+@reader("manipulator file")
 def read_manipulator(path: str | Path) -> Hexapod | SerialRobot:
     """The machine of a hexapod.json or robot.json.
 

@@ -37,6 +37,7 @@ from tomopose.manipulator.files import (
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import ErrorModel
 from tomopose.manipulator.twin import TwinRobots
+from tomopose.reading import reader
 from tomopose.units import Array, float_array
 
 KEYS = (
@@ -101,6 +102,7 @@ class TwinDrawing:
         return (scanner.T_WS @ scanner.T_TW(0.0)).inv @ T_HS
 
 
+@reader("twin.json")
 def read_twin(path: str | Path) -> TwinDrawing:
     """Read twin.json.
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from tomopose.errors import FileError
+from tomopose.reading import reader
 from tomopose.units import Array
 
 FOLDERS = {
@@ -57,6 +58,7 @@ def reference_pairs(folder: str | Path) -> dict[str, Path]:
     return found
 
 
+@reader("reference pair")
 def read_reference_pair(path: str | Path) -> ReferencePair:
     """One pair from its .ds file; the .fit lies beside it and the folder's name says the kind."""
     path = Path(path)

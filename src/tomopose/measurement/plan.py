@@ -6,14 +6,14 @@ to frame W of the volume.
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from tomopose.errors import FileError, InputError, SchemaVersionError, UnitError
+from tomopose.errors import InputError, SchemaVersionError, UnitError
 from tomopose.measurement.features.measurands import Kind, Rule
+from tomopose.reading import parse_toml, read_text, reader
 
 SCHEMA = "tomopose/measurement-plan/1"
 Vector = tuple[float, float, float]
@@ -236,15 +236,11 @@ def plan_from(document: dict[str, Any], where: str = "plan") -> MeasurementPlan:
         raise InputError(f"{where}: {faults}") from error
 
 
+@reader("measurement plan")
 def read_plan(path: str | Path) -> MeasurementPlan:
     """Read a plan from TOML.  FileError where it is missing or no TOML; otherwise as `plan_from`."""
     path = Path(path)
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError as error:
-        raise FileError(f"{path} does not exist", path=path) from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise FileError(f"{path} is no readable TOML: {error}", path=path) from error
+    document = parse_toml(read_text(path), path)
     return plan_from(document, path.name)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import time
 from collections.abc import Mapping
@@ -9,6 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from tomopose.atomic import only_writer
 from tomopose.errors import InputError
 from tomopose.provenance import provenance
 from tomopose.studies.parts.result import DEFAULT_SEED, Progress, Scale, StudyResult, require_scale
@@ -58,7 +60,8 @@ def run_study(
         key={"study": name, "scale": scale, "seed": seed},
     )
     begin = time.perf_counter()
-    rows, checks, figures, notes = module.run(scale, seed, steps, progress or (lambda done, total: None))
+    with contextlib.nullcontext() if folder is None else only_writer(Path(folder)):
+        rows, checks, figures, notes = module.run(scale, seed, steps, progress or (lambda done, total: None))
     return StudyResult(
         name=name,
         title=module.TITLE,

@@ -19,6 +19,7 @@ from tomopose.calibration.records.setup import held_scanner, observed_digest
 from tomopose.calibration.result import Calibration
 from tomopose.errors import FileError, InputError, SchemaVersionError
 from tomopose.files import write_text
+from tomopose.reading import parse_json, read_text, reader
 
 SCHEMA = "tomopose/history/1"
 
@@ -51,21 +52,15 @@ def history_entry(calibration: Calibration, *, label: str = "", machine: str = "
     }
 
 
+@reader("history")
 def read_history(path: str | Path) -> list[dict[str, Any]]:
     """All entries, in the order written.  FileError or SchemaVersionError names the line."""
     path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise FileError(f"cannot read {path}: {error}", path=path) from error
     entries = []
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip():
             continue
-        try:
-            entry = json.loads(line)
-        except ValueError as error:
-            raise FileError(f"{path}, line {number}: not valid JSON ({error})", path=path) from error
+        entry = parse_json(line, f"{path}, line {number}", constants=True)
         if not isinstance(entry, dict) or entry.get("schema") != SCHEMA:
             raise SchemaVersionError(f"{path}, line {number}: schema is not {SCHEMA}", path=path)
         if not isinstance(entry.get("parameters"), dict):

@@ -30,6 +30,7 @@ from tomopose.errors import InputError
 from tomopose.io.poses_csv import poses_from_table
 from tomopose.io.table_text import NUMBER, TextTable, read_table, read_text
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.reading import reader
 
 AXES = ("X", "Y", "Z", "U", "V", "W")
 COLUMNS = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")
@@ -50,6 +51,7 @@ class _Reply:
     text: list[str] = field(default_factory=list)
 
 
+@reader("position log")
 def read_gcs_log(path: str | Path, *, units_confirmed: bool = False) -> PoseSequence:
     """Read a log of replies or a recording, by the grammar above.
 

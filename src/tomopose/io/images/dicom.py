@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from tomopose.errors import FileError, InputError
-from tomopose.io.images.frames import Band, Image, require_grey, require_one_kind, unreadable
+from tomopose.io.images.frames import Band, Image, require_grey, require_one_kind
+from tomopose.reading import reading, require_plausible
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,21 +37,40 @@ def open_dicom(paths: list[Path], names: list[str]) -> DicomSource:
     kinds: list[tuple[str, tuple[int, int], np.dtype[Any]]] = []
     notes: list[str] = []
     for path, name in zip(paths, names, strict=True):
-        data = _dataset(path, pixels=False)
-        require_grey(str(path), np.dtype(np.uint16), int(data.get("SamplesPerPixel", 1)))
-        if str(data.get("LossyImageCompression", "00")) == "01":
-            raise InputError(f"{path} is compressed with loss; export it without")
-        if data.get("PhotometricInterpretation") == "MONOCHROME1" and not notes:
-            notes.append(f"{name}: the file says that low values are white (MONOCHROME1); values are used as stored")
-        count = int(data.get("NumberOfFrames", 1) or 1)
-        kinds.append((str(path), (int(data.Rows), int(data.Columns)), _dtype(data)))
-        for k in range(count):
-            frames.append((path, k))
-            frame_names.append(f"{name}[{k}]" if count > 1 else name)
+        with reading(path, "DICOM file"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # values are converted when they are asked for
+            data = _dataset(path, pixels=False)
+            require_grey(str(path), np.dtype(np.uint16), int(data.get("SamplesPerPixel", 1)))
+            if str(data.get("LossyImageCompression", "00")) == "01":
+                raise InputError(f"{path} is compressed with loss; export it without")
+            if data.get("PhotometricInterpretation") == "MONOCHROME1" and not notes:
+                notes.append(
+                    f"{name}: the file says that low values are white (MONOCHROME1); values are used as stored"
+                )
+            count = int(data.get("NumberOfFrames", 1) or 1)
+            _require_room(path, data, count)
+            kinds.append((str(path), (int(data.Rows), int(data.Columns)), _dtype(data)))
+            for k in range(count):
+                frames.append((path, k))
+                frame_names.append(f"{name}[{k}]" if count > 1 else name)
     require_one_kind(kinds)
     return DicomSource(
         names=tuple(frame_names), shape=kinds[0][1], dtype=kinds[0][2], frames=tuple(frames), warnings=tuple(notes)
     )
+
+
+def _require_room(path: Path, data: Any, count: int) -> None:
+    """FileError where the frames that a header claims cannot lie in the file."""
+    rows, columns, stored = int(data.Rows), int(data.Columns), path.stat().st_size
+    if count < 1 or rows < 1 or columns < 1:
+        raise FileError(f"{path} claims {count} frames of {columns} x {rows} pixels", path=path)
+    claimed = count * rows * columns * max(int(data.BitsAllocated) // 8, 1)
+    if not data.file_meta.TransferSyntaxUID.is_compressed and claimed > stored:
+        raise FileError(
+            f"{path} is truncated: {count} frames of {columns} x {rows} pixels need {claimed} bytes, it has {stored}",
+            path=path,
+        )
+    require_plausible(path, f"{count} frames of {columns} x {rows} pixels", claimed, stored)
 
 
 def _rescale(data: Any) -> tuple[float, float]:
@@ -66,10 +86,9 @@ def _dtype(data: Any) -> np.dtype[Any]:
 def _dataset(path: Path, *, pixels: bool) -> Any:
     """The data set of a file; without a file header its syntax is implicit little endian, DICOM's default."""
     import pydicom
-    from pydicom.errors import InvalidDicomError
     from pydicom.uid import ImplicitVRLittleEndian
 
-    try:
+    with reading(path, "DICOM file"):
         if path.stat().st_size == 0:
             raise FileError(f"{path} is empty (0 bytes); copy it again", path=path)
         with warnings.catch_warnings():
@@ -77,10 +96,6 @@ def _dataset(path: Path, *, pixels: bool) -> Any:
             data = pydicom.dcmread(path, force=True, stop_before_pixels=not pixels)
             if not data.file_meta.get("TransferSyntaxUID"):
                 data.file_meta.TransferSyntaxUID = ImplicitVRLittleEndian
-    except OSError as error:
-        raise unreadable(path, error) from error
-    except (InvalidDicomError, EOFError, ValueError, AttributeError, KeyError, NotImplementedError) as error:
-        raise FileError(f"{path} is no readable DICOM file: {error}", path=path) from error
     missing = [k for k in ("Rows", "Columns", "BitsAllocated") if k not in data]
     if missing:
         raise FileError(f"{path} is no DICOM image ({', '.join(missing)} missing; truncated?)", path=path)
@@ -90,13 +105,10 @@ def _dataset(path: Path, *, pixels: bool) -> Any:
 def _pixels(path: Path) -> Image:
     """All frames of a file, [frame, row, column]."""
     data = _dataset(path, pixels=True)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            pixels: Image = data.pixel_array
-    except Exception as error:  # pixel handlers raise errors of many kinds
-        raise FileError(f"{path} is damaged or truncated: {error}", path=path) from error
-    slope, intercept = _rescale(data)
-    if (slope, intercept) != (1.0, 0.0):
-        pixels = (pixels * slope + intercept).astype(np.float32)
-    return pixels.reshape(-1, int(data.Rows), int(data.Columns))
+    with reading(path, "DICOM file (damaged or truncated)"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        pixels: Image = data.pixel_array
+        slope, intercept = _rescale(data)
+        if (slope, intercept) != (1.0, 0.0):
+            pixels = (pixels * slope + intercept).astype(np.float32)
+        return pixels.reshape(-1, int(data.Rows), int(data.Columns))

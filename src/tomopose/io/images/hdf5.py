@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.errors import FileError, InputError
-from tomopose.io.images.frames import Band, Image, require_grey, unreadable
+from tomopose.errors import InputError
+from tomopose.io.images.frames import Band, Image, require_grey
+from tomopose.reading import reading
+from tomopose.reading.hdf5 import checked_hdf5
 
 PROJECTION, FLAT, DARK = 0, 1, 2
 """NXtomo's image_key; 3 marks frames to be left out."""
@@ -37,11 +39,8 @@ class Hdf5Source:
         import h5py
 
         r0, r1, c0, c1 = band
-        try:
-            with h5py.File(self.path, "r") as file:
-                part: Image = file[self.dataset][k, r0:r1, c0:c1]
-        except OSError as error:
-            raise unreadable(self.path, error) from error
+        with reading(self.path, "stack of radiographs"), h5py.File(self.path, "r") as file:
+            part: Image = file[self.dataset][k, r0:r1, c0:c1]
         return part.astype(part.dtype.newbyteorder("="), copy=False)
 
     def mean(self, frames: tuple[int, ...]) -> Image | None:
@@ -58,39 +57,34 @@ def open_hdf5(path: Path, name: str, dataset: str | None) -> Hdf5Source:
     """The frames of an HDF5 file.  InputError lists the datasets where the right one is not clear."""
     import h5py
 
-    try:
-        with h5py.File(path, "r") as file:
-            stacks = _stacks(file)
-            where = dataset.strip("/") if dataset else _only(path, file, stacks)
-            if where not in file:
-                raise InputError(f"{path} holds no dataset {where!r}; stacks are: {', '.join(stacks) or 'none'}")
-            data = file[where]
-            if not isinstance(data, h5py.Dataset) or data.ndim != 3 or 0 in data.shape:
-                raise InputError(
-                    f"{path}: {where} has shape {getattr(data, 'shape', 'of a group')}; a stack [frame, row, column] "
-                    f"is needed; stacks are: {', '.join(stacks) or 'none'}"
-                )
-            require_grey(f"{path}, {where}", data.dtype)
-            keys = _image_key(path, file, where, len(data))
-            frames = np.flatnonzero(keys == PROJECTION)
-            if frames.size == 0:
-                raise InputError(f"{path}: no frame of {where} is a projection (image_key 0)")
-            rows = data.attrs.get("image_rows")
-            return Hdf5Source(
-                names=tuple(f"{name}[{k}]" for k in frames),
-                shape=(int(data.shape[1]), int(data.shape[2])),
-                dtype=data.dtype.newbyteorder("="),
-                path=path,
-                dataset=where,
-                frames=tuple(frames.tolist()),
-                flats=tuple(np.flatnonzero(keys == FLAT).tolist()),
-                darks=tuple(np.flatnonzero(keys == DARK).tolist()),
-                image_rows=None if rows is None else str(rows),
+    with reading(path, "HDF5 file (truncated?)"), h5py.File(checked_hdf5(path), "r") as file:
+        stacks = _stacks(file)
+        where = dataset.strip("/") if dataset else _only(path, file, stacks)
+        if where not in file:
+            raise InputError(f"{path} holds no dataset {where!r}; stacks are: {', '.join(stacks) or 'none'}")
+        data = file[where]
+        if not isinstance(data, h5py.Dataset) or data.ndim != 3 or 0 in data.shape:
+            raise InputError(
+                f"{path}: {where} has shape {getattr(data, 'shape', 'of a group')}; a stack [frame, row, column] "
+                f"is needed; stacks are: {', '.join(stacks) or 'none'}"
             )
-    except OSError as error:
-        if path.exists():
-            raise FileError(f"{path} is no readable HDF5 file (truncated?): {error}", path=path) from error
-        raise unreadable(path, error) from error
+        require_grey(f"{path}, {where}", data.dtype)
+        keys = _image_key(path, file, where, len(data))
+        frames = np.flatnonzero(keys == PROJECTION)
+        if frames.size == 0:
+            raise InputError(f"{path}: no frame of {where} is a projection (image_key 0)")
+        rows = data.attrs.get("image_rows")
+        return Hdf5Source(
+            names=tuple(f"{name}[{k}]" for k in frames),
+            shape=(int(data.shape[1]), int(data.shape[2])),
+            dtype=data.dtype.newbyteorder("="),
+            path=path,
+            dataset=where,
+            frames=tuple(frames.tolist()),
+            flats=tuple(np.flatnonzero(keys == FLAT).tolist()),
+            darks=tuple(np.flatnonzero(keys == DARK).tolist()),
+            image_rows=None if rows is None else str(rows),
+        )
 
 
 def _stacks(file: Any) -> list[str]:

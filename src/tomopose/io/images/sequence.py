@@ -15,6 +15,7 @@ import numpy as np
 from tomopose.errors import InputError
 from tomopose.io.images.correction import FlatField
 from tomopose.io.images.frames import FrameSource, Image
+from tomopose.reading import reading
 
 Rows = Literal["top-first", "bottom-first"]
 
@@ -69,10 +70,11 @@ class ImageSequence:
         if not (0 <= v0 <= v1 <= n_v and 0 <= u0 <= u1 <= n_u):
             raise InputError(f"region v {v0}:{v1}, u {u0}:{u1} is not inside an image of {n_u} x {n_v} pixels")
         k = self.index[i]
-        if self.rows == "top-first":
-            part = np.array(self.source.read(k, (n_v - v1, n_v - v0, u0, u1))[::-1], order="C")
-        else:
-            part = np.array(self.source.read(k, (v0, v1, u0, u1)), order="C")
+        with reading(self.source.names[k], "radiograph"):
+            if self.rows == "top-first":
+                part = np.array(self.source.read(k, (n_v - v1, n_v - v0, u0, u1))[::-1], order="C")
+            else:
+                part = np.array(self.source.read(k, (v0, v1, u0, u1)), order="C")
         return part if self.correction is None else self.correction.transmission(part, v0, u0)
 
     def fetch(self, i: int, v0: int, v1: int) -> None:

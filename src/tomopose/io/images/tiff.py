@@ -5,6 +5,7 @@ Plain pages are read straight from the file; of compressed pages only the strips
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,11 @@ import numpy as np
 
 from tomopose.errors import EngineMissingError, FileError, InputError
 from tomopose.io.images.frames import Band, Image, fetch_ahead, read_block, require_grey, require_one_kind, unreadable
+from tomopose.io.images.tiff_structure import require_sound_tiff
+from tomopose.reading import reading
 
 LOSSLESS = {1: "none", 5: "LZW", 8: "deflate", 32773: "PackBits", 32946: "deflate", 34925: "LZMA", 50000: "Zstandard"}
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds wrong is said in one error
 PHOTOMETRIC_GREY = (0, 1)
 MIN_IS_WHITE = 0
 
@@ -80,10 +84,11 @@ def _pages(path: Path) -> tuple[list[TiffFrame], list[tuple[int, int]], bool]:
     """Frames and shapes of a file, and whether it says that 0 is white."""
     import tifffile
 
-    try:
+    with reading(path, "TIFF (truncated?)"):
         size = path.stat().st_size
         if size == 0:
             raise FileError(f"{path} is empty (0 bytes); copy it again", path=path)
+        require_sound_tiff(path)
         with tifffile.TiffFile(path) as tif:
             frames, shapes, inverted = [], [], False
             for k, entry in enumerate(tif.pages):
@@ -104,12 +109,6 @@ def _pages(path: Path) -> tuple[list[TiffFrame], list[tuple[int, int]], bool]:
                 shapes *= count
                 if start + count * step > size:
                     raise _truncated(path, start + count * step, size)
-    except OSError as error:
-        raise unreadable(path, error) from error
-    except (tifffile.TiffFileError, ValueError, KeyError, IndexError, TypeError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise FileError(f"{path} is no readable TIFF (truncated?): {error}", path=path) from error
     if not frames:
         raise FileError(f"{path} holds no images", path=path)
     return frames, shapes, inverted
@@ -166,6 +165,10 @@ def _decode(frame: TiffFrame, band: Band) -> Image:
             return out
     except OSError as error:
         raise unreadable(frame.path, error) from error
+    except MemoryError as error:
+        raise FileError(
+            f"{frame.path}, page {frame.page} asks for more memory than is free", path=frame.path
+        ) from error
     except (ImportError, ValueError) as error:
         if "imagecodecs" in str(error):
             raise EngineMissingError(

@@ -13,8 +13,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tomopose.errors import FileError, InputError, ShapeError, UnitError
+from tomopose.errors import InputError, ShapeError, UnitError
 from tomopose.measurement.mesh.mesh import Mesh, nearest_triangles
+from tomopose.reading import read_text, reader
 from tomopose.units import Array
 
 Interpolation = Literal["cells", "natural"]
@@ -24,23 +25,22 @@ BLOCK = 2000
 COLUMNS = ("x_mm", "y_mm", "z_mm")
 
 
+@reader("table of probed points")
 def read_probed_points(path: str | Path) -> Array:
     """Probed points (n, 3), mm, part coordinates, from CSV with the columns x_mm, y_mm, z_mm.
 
     FileError for a file that cannot be read, UnitError for columns without their unit.
     """
     path = Path(path)
-    try:
-        lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line and line[0] != "#"]
-        rows = list(csv.DictReader(lines, delimiter="\t" if lines and "\t" in lines[0] else ","))
-        names = [] if not rows else [n.strip() for n in rows[0]]
-        if not set(COLUMNS) <= set(names):
-            raise UnitError(f"{path}: columns are {', '.join(names) or 'missing'}; {', '.join(COLUMNS)} are needed")
-        return np.array([[float({k.strip(): v for k, v in r.items()}[c]) for c in COLUMNS] for r in rows])
-    except UnitError:
-        raise
-    except (OSError, ValueError, TypeError, UnicodeDecodeError) as error:
-        raise FileError(f"{path} is no readable table of probed points: {error}", path=path) from error
+    lines = [line for line in read_text(path).splitlines() if line and line[0] != "#"]
+    rows = list(csv.DictReader(lines, delimiter="\t" if lines and "\t" in lines[0] else ","))
+    names = [] if not rows else [str(n).strip() for n in rows[0]]
+    if not set(COLUMNS) <= set(names):
+        raise UnitError(f"{path}: columns are {', '.join(names) or 'missing'}; {', '.join(COLUMNS)} are needed")
+    points = np.array([[float({str(k).strip(): v for k, v in r.items()}[c]) for c in COLUMNS] for r in rows])
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: probed point {int(np.argmin(np.isfinite(points).all(axis=1))) + 1} is not finite")
+    return points
 
 
 def corrected_reference(mesh: Mesh, probed: Any, *, interpolation: Interpolation = "cells") -> Mesh:

@@ -13,8 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from tomopose.errors import FileError, InputError, ShapeError
+from tomopose.reading import read_bytes, reader, reading
 from tomopose.units import Array, float_array
 
+MEMORY_PER_BYTE = 20
+"""Bytes in memory for each byte of a file of triangles, while equal corners are joined."""
 SHARP = np.radians(30.0)
 """Angle between neighbouring triangles from which their common edge is an edge of the part."""
 
@@ -142,6 +145,7 @@ class Mesh:
         return self
 
 
+@reader("mesh")
 def read_mesh(path: str | Path) -> Mesh:
     """A mesh from STL (binary or text), PLY (text or binary little-endian), in mm, or STEP; equal vertices are joined.
 
@@ -152,19 +156,17 @@ def read_mesh(path: str | Path) -> Mesh:
         from tomopose.measurement.mesh.step import read_step
 
         return read_step(path)
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror or error}", path=path) from error
-    reader = {".stl": _read_stl, ".ply": _read_ply}.get(path.suffix.lower())
-    if reader is None:
+    content = read_bytes(path, per_byte=MEMORY_PER_BYTE)
+    parse = {".stl": _read_stl, ".ply": _read_ply}.get(path.suffix.lower())
+    if parse is None:
         raise FileError(
             f"{path}: {path.suffix!r} is no mesh format that is read here; .stl, .ply and .step are", path=path
         )
-    try:
-        return reader(content)
-    except (ValueError, IndexError, KeyError, struct.error) as error:
-        raise FileError(f"{path} is no readable mesh: {error}", path=path) from error
+    with reading(path, "mesh"):  # a mesh's own errors do not name the file
+        try:
+            return parse(content)
+        except InputError as error:
+            raise FileError(f"{path} is no readable mesh: {error}", path=path) from error
 
 
 def _read_stl(content: bytes) -> Mesh:
@@ -178,6 +180,8 @@ def _read_stl(content: bytes) -> Mesh:
         corners = np.array([[float(v) for v in words[k + 1 : k + 4]] for k in rows])
         if len(corners) % 3 or not len(corners):
             raise ValueError(f"{len(corners)} vertices make no triangles")
+    if not np.isfinite(corners).all():
+        raise ValueError("a vertex is not finite")
     points, inverse = np.unique(corners.astype(np.float64), axis=0, return_inverse=True)
     faces = inverse.reshape(-1, 3)
     whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
@@ -210,7 +214,7 @@ def _read_ply(content: bytes) -> Mesh:
     lines = [line.split() for line in content[:end].decode("ascii").splitlines()]
     if lines[0] != ["ply"]:
         raise ValueError("the first line is not 'ply'")
-    kind = next(w[1] for w in lines if w[:1] == ["format"])
+    kind = next((w[1] for w in lines if w[:1] == ["format"]), "")
     counts = {w[1]: int(w[2]) for w in lines if w[:1] == ["element"]}
     element, fields, lists = "", [], []
     for w in lines:
@@ -221,6 +225,8 @@ def _read_ply(content: bytes) -> Mesh:
         elif w[:1] == ["property"] and element == "face":
             lists.append(w)
     n, m = counts["vertex"], counts["face"]
+    if min(n, m) < 1 or max(n, m) > len(body):
+        raise ValueError(f"{n} vertices and {m} faces are announced, {len(body)} bytes follow")
     if len(lists) != 1 or lists[0][1] != "list":
         raise ValueError("faces need one list of vertex indices and nothing else")
     if kind == "ascii":

@@ -17,6 +17,7 @@ import numpy as np
 
 from tomopose.errors import EngineMissingError, FileError
 from tomopose.measurement.mesh.mesh import Mesh
+from tomopose.reading import reader
 from tomopose.units import Array
 
 INSTALL_LINE = "pip install cascadio"
@@ -26,6 +27,7 @@ MM_PER_METRE = 1000.0
 INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
 
 
+@reader("STEP file")
 def read_step(path: str | Path, *, deflection: float = DEFLECTION) -> Mesh:
     """The solid in a STEP file as triangles, mm.
 
@@ -33,8 +35,6 @@ def read_step(path: str | Path, *, deflection: float = DEFLECTION) -> Mesh:
     FileError for a file that holds no solid, EngineMissingError without cascadio.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileError(f"{path} does not exist", path=path)
     try:
         cascadio: Any = import_module("cascadio")
     except ImportError as error:
@@ -45,7 +45,7 @@ def read_step(path: str | Path, *, deflection: float = DEFLECTION) -> Mesh:
         content = glb.read_bytes() if glb.exists() else b""
     try:
         corners = np.concatenate(_triangles(content))
-    except (ValueError, KeyError, IndexError, struct.error) as error:
+    except (ValueError, KeyError, IndexError, TypeError, RecursionError, struct.error) as error:
         raise FileError(f"{path} holds no solid that could be read", path=path) from error
     # Faces of a solid share the points of their common edge, but each has its own copies.
     points, inverse = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)

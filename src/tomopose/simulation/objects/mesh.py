@@ -17,6 +17,7 @@ import numpy as np
 
 from tomopose.errors import EngineFailedError, EngineMissingError, FileError, InputError, ShapeError
 from tomopose.geometry.frames import Frame
+from tomopose.reading import reader
 from tomopose.units import Array
 
 INSTALL = 'pip install "tomopose[sim]"'
@@ -213,10 +214,9 @@ def _load(path: str, scale: float) -> TriangleMesh:
     return TriangleMesh(vertices=np.asarray(loaded.vertices) * scale, faces=np.asarray(loaded.faces)).require_closed()
 
 
+@reader("mesh")
 def read_mesh(path: str | Path, *, scale: float = 1.0) -> TriangleMesh:
     """A closed triangle mesh from an STL, PLY or OBJ file; scale: mm per unit of the file."""
-    if not Path(path).is_file():
-        raise FileError(f"{path} does not exist", path=path)
     return _load(str(path), scale)
 
 

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.errors import FileError, InputError
+from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import rotation_from_angles
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.reading import read_text, require_file
 from tomopose.simulation.detector.detector import Detector
 from tomopose.simulation.detector.scatter_glare_mtf import MTF, Glare, Scatter
 from tomopose.simulation.objects.ball import ball_in_holder
@@ -106,10 +107,8 @@ def _material(part: S.MaterialPart) -> Material:
 def _table(scene: S.Scene, name: str, column: str) -> tuple[Array, Array]:
     """Energies (keV) and values of a CSV file with the columns energy_keV and `column`."""
     path = Path(scene.folder) / name
-    try:
-        lines = [x for x in path.read_text(encoding="utf-8-sig").splitlines() if x.strip() and not x.startswith("#")]
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror or error}", path=path) from error
+    require_file(path, "table")
+    lines = [x for x in read_text(path).splitlines() if x.strip() and not x.startswith("#")]
     if not lines or [x.strip() for x in lines[0].split(",")] != ["energy_keV", column]:
         raise InputError(f"{path}: the first line must name the columns energy_keV,{column}")
     try:

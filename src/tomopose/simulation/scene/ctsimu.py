@@ -22,6 +22,7 @@ from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
 from tomopose.geometry.scanner import R_WS, Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.reading import reading
 from tomopose.simulation.detector.detector import Detector
 from tomopose.simulation.objects.mesh import MeshSolid, TriangleMesh, read_mesh
 from tomopose.simulation.physics.materials import MATERIALS, Material, from_formula
@@ -75,7 +76,17 @@ def _number(content: Any, *keys: str, default: float | None = None) -> float | N
 
 
 def run_from_ctsimu(content: Mapping[str, Any], *, folder: str | Path = ".", seed: int = 0) -> SimulatedRun:
-    """The run that a scenario's JSON content describes; mesh files are taken from `folder`."""
+    """The run that a scenario's JSON content describes; mesh files are taken from `folder`.
+
+    InputError for what the virtual scanner does not read, FileError for content that is no scenario.
+    """
+    with reading("the content", "CTSimU scenario"):
+        if not isinstance(content, Mapping):
+            raise InputError(f"a CTSimU scenario is a JSON object; this is a {type(content).__name__}")
+        return _run(content, Path(folder), seed)
+
+
+def _run(content: Mapping[str, Any], folder: Path, seed: int) -> SimulatedRun:
     for path in NOT_READ:
         if _get(content, *path) not in (None, {}) and _get(content, *path, "file") is not False:
             raise InputError(f"CTSimU: {'.'.join(path)} is not read by the virtual scanner")
@@ -84,7 +95,7 @@ def run_from_ctsimu(content: Mapping[str, Any], *, folder: str | Path = ".", see
     for entry in content.get("materials") or ():
         materials[str(entry["id"])] = _material(entry)
     poses = PoseSequence(T_MH=T_MH, pose_id=tuple(str(k) for k in range(len(T_MH))), source="set")
-    meshes = tuple(_sample(entry, Path(folder)) for entry in content.get("samples") or ())
+    meshes = tuple(_sample(entry, folder) for entry in content.get("samples") or ())
     for mesh in meshes:
         if mesh.material not in materials:
             raise InputError(f"CTSimU: sample {mesh.name!r} is of material {mesh.material!r}, which is not defined")

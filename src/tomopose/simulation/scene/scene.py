@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from tomopose.errors import FileError, InputError
+from tomopose.errors import InputError
+from tomopose.reading import parse_toml, read_text, reader
 
 SCHEMA = "tomopose/scene/1"
 Vector = tuple[float, float, float]
@@ -274,15 +274,11 @@ def scene_from(document: dict[str, Any], *, where: str = "scene", folder: str = 
         raise InputError(f"{where}: {found}") from error
 
 
+@reader("scene")
 def read_scene(path: str | Path) -> Scene:
     """The scene in a TOML file (docs/formats/scene.md)."""
     path = Path(path)
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror or error}", path=path) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise FileError(f"{path} is no TOML: {error}", path=path) from error
+    document = parse_toml(read_text(path), path)
     if "folder" in document:
         raise InputError(f"{path}: folder: no key of a scene file")
     return scene_from(document, where=str(path), folder=str(path.parent))

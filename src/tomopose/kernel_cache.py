@@ -1,0 +1,82 @@
+"""Where compiled kernels are kept: beside the package, else in the user's cache folder, a temporary one, or nowhere.
+
+numba keeps them in the package's own folders and ends the import where it cannot write them: in a container with a
+read-only file system, or for a service without a home.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+VARIABLE = "NUMBA_CACHE_DIR"
+"""numba's own: a folder that the user names in it is used wherever it can be written."""
+
+
+def choose_cache_folder(package: Path, environment: Mapping[str, str] = os.environ) -> None:
+    """Sets numba's folder for this process and its children; leaves numba's own choice where that works."""
+    named = environment.get(VARIABLE)
+    if named is None and _writable(package):
+        return
+    for folder in candidates(environment):
+        if _usable(folder):
+            os.environ[VARIABLE] = str(folder)
+            return
+    os.environ.pop(VARIABLE, None)
+    compile_each_time()
+
+
+def candidates(environment: Mapping[str, str]) -> Iterator[Path]:
+    """Folders to try, in this order."""
+    if environment.get(VARIABLE):
+        yield Path(environment[VARIABLE])
+    if sys.platform == "win32":
+        homes = [environment.get("LOCALAPPDATA")]
+    elif sys.platform == "darwin":
+        homes = [f"{environment['HOME']}/Library/Caches" if environment.get("HOME") else None]
+    else:
+        homes = [
+            environment.get("XDG_CACHE_HOME"),
+            f"{environment['HOME']}/.cache" if environment.get("HOME") else None,
+        ]
+    for home in homes:
+        if home and os.path.isabs(home):
+            yield Path(home) / "tomopose" / "kernels"
+    user = os.getuid() if hasattr(os, "getuid") else "user"
+    with contextlib.suppress(OSError):
+        yield Path(tempfile.gettempdir()) / f"tomopose-kernels-{user}"
+    if sys.platform == "linux":
+        yield Path("/dev/shm") / f"tomopose-kernels-{user}"
+
+
+def _writable(folder: Path) -> bool:
+    """Whether files can be made in a folder; asked without making one."""
+    try:
+        return os.access(folder, os.W_OK | os.X_OK)
+    except OSError:
+        return False
+
+
+def _usable(folder: Path) -> bool:
+    """Whether the folder is there, or can be made, for this user alone: what lies in it is run as code."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        facts = folder.stat()
+        if hasattr(os, "getuid") and (facts.st_uid != os.getuid() or facts.st_mode & (stat.S_IWGRP | stat.S_IWOTH)):
+            return False
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+def compile_each_time() -> None:
+    """Nothing can be written anywhere: kernels are compiled in each process and kept in its memory alone."""
+    from numba.core.dispatcher import Dispatcher
+
+    Dispatcher.enable_caching = lambda self: None
