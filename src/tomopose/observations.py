@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.units import Array, float_array, rows_at
@@ -90,7 +91,7 @@ class BallObservations(Rows):
                 object.__setattr__(self, name, array)
 
     @classmethod
-    def from_sigma(cls, x_D: Any, sigma: Any, *, pose_id: Any = None, **columns: Any) -> BallObservations:
+    def from_sigma(cls, x_D: ArrayLike, sigma: ArrayLike, *, pose_id: Any = None, **columns: Any) -> BallObservations:
         """From centres (n, 2) and standard uncertainties (a number, (n,) or (n, 2)), px, without correlation."""
         x_D = np.asarray(x_D, dtype=np.float64)
         s = np.asarray(sigma, dtype=np.float64)

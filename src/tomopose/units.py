@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 Array = npt.NDArray[np.float64]
 
@@ -17,7 +18,7 @@ MICROMETRES_PER_MM = 1000.0
 MICRORADIANS_PER_RAD = 1.0e6
 
 
-def float_array(values: Any) -> Array:
+def float_array(values: ArrayLike) -> Array:
     """A float64 copy that cannot be written to, so that value types stay frozen."""
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)

@@ -8,6 +8,7 @@ from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.provenance import Provenance
@@ -79,11 +80,11 @@ class VoxelGrid:
         matrix[:3, 3] = self.origin
         return matrix
 
-    def points(self, index: Any) -> Array:
+    def points(self, index: ArrayLike) -> Array:
         """Centres (..., 3), mm in W, of voxels given by array indices (..., 3) as (iz, iy, ix); fractions allowed."""
         return self.origin + self.spacing * np.asarray(index, dtype=np.float64)[..., ::-1]
 
-    def indices(self, x_W: Any) -> Array:
+    def indices(self, x_W: ArrayLike) -> Array:
         """Fractional array indices (..., 3), (iz, iy, ix), of points (..., 3) in W, mm."""
         return ((np.asarray(x_W, dtype=np.float64) - self.origin) / self.spacing)[..., ::-1]
 

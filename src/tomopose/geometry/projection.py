@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError, OutOfViewError, ShapeError
 from tomopose.geometry.frames import Frame
@@ -18,7 +18,7 @@ PANEL_TOLERANCE = 1e-7
 """Largest relative skew and aspect error of a matrix that still counts as a flat panel of rectangular pixels."""
 
 
-def project(P: Any, x: Any) -> Array:
+def project(P: ArrayLike, x: ArrayLike) -> Array:
     """Pixels (..., m, 2) of points x (m, 3), mm, under matrices P (..., 3, 4).  Eq. (2).  NaN where w <= 0."""
     P, x = np.asarray(P, dtype=np.float64), np.asarray(x, dtype=np.float64)
     h = np.einsum("...ij,mj->...mi", P[..., :3], x) + P[..., None, :, 3]
@@ -28,7 +28,7 @@ def project(P: Any, x: Any) -> Array:
 
 
 def project_ball(
-    scanner: Scanner, *, T_HT: RigidTransform, T_MH: RigidTransform, t: Any, alpha: Array | float = 0.0
+    scanner: Scanner, *, T_HT: RigidTransform, T_MH: RigidTransform, t: ArrayLike, alpha: Array | float = 0.0
 ) -> Array:
     r"""Project the ball centre onto the detector, once per pose.  Eq. (6).
 
@@ -88,7 +88,7 @@ def eq5_matrices(
     return scanner.P_S @ (scanner.T_WS.matrix @ chain.matrix)
 
 
-def canonical(P: Any, in_front: Any = (0.0, 0.0, 0.0)) -> Array:
+def canonical(P: ArrayLike, in_front: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
     """P scaled to |P[2, :3]| = 1 with w > 0 at the point `in_front` of W, mm.
 
     The origin is the field's convention (P[2, 3] > 0).  A robot that stands behind the source puts the origin of W at
@@ -132,7 +132,9 @@ class ViewGeometry:
         return n * sign[:, None]
 
 
-def decompose(P: Any, *, n_u: int, n_v: int, p_u: float, p_v: float, in_front: Any = (0.0, 0.0, 0.0)) -> ViewGeometry:
+def decompose(
+    P: ArrayLike, *, n_u: int, n_v: int, p_u: float, p_v: float, in_front: ArrayLike = (0.0, 0.0, 0.0)
+) -> ViewGeometry:
     """Source and panel of matrices P (n, 3, 4), given the panel's size and pitch; in_front as in `canonical`.
 
     P alone fixes only d_SD / pitch.  A matrix with skew or with an aspect that differs from p_u / p_v has no flat panel
@@ -167,7 +169,7 @@ def decompose(P: Any, *, n_u: int, n_v: int, p_u: float, p_v: float, in_front: A
     )
 
 
-def compose(source: Any, centre: Any, U: Any, V: Any, *, n_u: int, n_v: int) -> Array:
+def compose(source: ArrayLike, centre: ArrayLike, U: ArrayLike, V: ArrayLike, *, n_u: int, n_v: int) -> Array:
     """Matrices (n, 3, 4) of sources, panel centres and pixel steps (each (n, 3), mm): the inverse of `decompose`."""
     source, centre, U, V = (np.asarray(x, dtype=np.float64) for x in (source, centre, U, V))
     origin = centre - (n_u - 1) / 2 * U - (n_v - 1) / 2 * V
@@ -202,7 +204,7 @@ class ProjectionMatrices(Rows):
     points_sigma: Array | None = None
     points_sigma_shared: Array | None = None
     scanner: Scanner | None = None
-    in_front: Any = (0.0, 0.0, 0.0)
+    in_front: ArrayLike = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         in_front = float_array(self.in_front)
@@ -241,7 +243,7 @@ class ProjectionMatrices(Rows):
             columns["points_sigma_rms_px"] = np.sqrt(np.mean(self.points_sigma**2, axis=1))
         return columns
 
-    def project(self, x_W: Any) -> Array:
+    def project(self, x_W: ArrayLike) -> Array:
         """Pixels (n, m, 2) of points (m, 3) in W."""
         return project(self.P, x_W)
 
@@ -283,7 +285,7 @@ class ProjectionMatrices(Rows):
             scanner=None if self.scanner is None else self.scanner.binned(factor),
         )
 
-    def require_in_front(self, x_W: Any) -> None:
+    def require_in_front(self, x_W: ArrayLike) -> None:
         """OutOfViewError, naming the views, where points (m, 3) of W lie behind the source."""
         bad = np.flatnonzero(np.isnan(self.project(x_W)).any(axis=(1, 2)))
         if bad.size:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import FrameMismatchError, InputError, ShapeError
 from tomopose.geometry.frames import Frame
@@ -51,12 +52,14 @@ class RigidTransform:
         return cls(R=np.eye(3), t=np.zeros(3), source=frame, target=target or frame)
 
     @classmethod
-    def from_angles(cls, angles: Any, t: Any, *, source: Frame, target: Frame) -> RigidTransform:
+    def from_angles(cls, angles: ArrayLike, t: ArrayLike, *, source: Frame, target: Frame) -> RigidTransform:
         """From the paper's angles (rad) of R = R_x R_y R_z and t (mm)."""
-        return cls(R=rotation_from_angles(np.asarray(angles)), t=t, source=source, target=target)
+        return cls(
+            R=rotation_from_angles(np.asarray(angles)), t=np.asarray(t, dtype=np.float64), source=source, target=target
+        )
 
     @classmethod
-    def from_matrix(cls, matrix: Any, *, source: Frame, target: Frame) -> RigidTransform:
+    def from_matrix(cls, matrix: ArrayLike, *, source: Frame, target: Frame) -> RigidTransform:
         """From homogeneous (4, 4) or (n, 4, 4) matrices, mm."""
         m = np.asarray(matrix, dtype=np.float64)
         if m.shape[-2:] != (4, 4):
@@ -99,7 +102,7 @@ class RigidTransform:
         V_inv = np.eye(3) - W / 2 + c * (W @ W)
         return np.concatenate([(V_inv @ self.t[..., None])[..., 0], w], axis=-1)
 
-    def apply(self, x: Any) -> Array:
+    def apply(self, x: ArrayLike) -> Array:
         """Points (..., 3) in source to target.  A sequence of n transforms and points (m, 3) gives (n, m, 3)."""
         x = np.asarray(x, dtype=np.float64)
         if self.R.ndim == 2:

@@ -37,7 +37,7 @@ def write_matrices(
         "pose_id": np.array(P.pose_id, dtype=np.str_),
     }
     content |= {key: getattr(P, name) for key, name in SIGMA.items() if getattr(P, name) is not None}
-    if P.in_front.any():
+    if np.any(P.in_front):
         content["in_front_mm"] = P.in_front
     if P.scanner is not None:
         content["scanner"] = json.dumps({"schema": "tomopose/scanner/1", **scanner_document(P.scanner)})

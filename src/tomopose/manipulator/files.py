@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError, SchemaVersionError, ShapeError, UnitError
 from tomopose.files import read_json, require_absent, write_json
@@ -258,7 +259,7 @@ def _finite(value: Any, key: str, where: str) -> float:
     return float(value)
 
 
-def vector(value: Any, shape: tuple[int, ...], name: str, where: str) -> Array:
+def vector(value: ArrayLike, shape: tuple[int, ...], name: str, where: str) -> Array:
     """Finite numbers of that shape, or ShapeError or InputError."""
     try:
         array = np.array(value, dtype=np.float64)

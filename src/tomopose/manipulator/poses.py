@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.frames import Frame
@@ -108,8 +109,8 @@ class PoseSequence(Rows):
     @classmethod
     def from_table(
         cls,
-        positions: Any,
-        orientations: Any,
+        positions: ArrayLike,
+        orientations: ArrayLike,
         *,
         pose_id: Sequence[Any] | None = None,
         convention: str = "pi-hexapod",

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.calibration.model.ball_projection import projection_blocks
 from tomopose.calibration.model.covariance import inverse_information
@@ -97,7 +98,7 @@ def predicted_covariance(
     poses: PoseSequence,
     *,
     T_HT: RigidTransform,
-    t: Any,
+    t: ArrayLike,
     sigma: float = SIGMA_PX,
     free: FreeParameters | None = None,
 ) -> Array:
@@ -118,7 +119,7 @@ def plan_poses(
     scanner: Scanner,
     *,
     T_HT: RigidTransform | None = None,
-    t: Any = BALL_MM,
+    t: ArrayLike = BALL_MM,
     n: int | None = None,
     goal: float | None = None,
     sigma: float = SIGMA_PX,

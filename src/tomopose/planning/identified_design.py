@@ -8,9 +8,9 @@ lowers the sum of variances by tr((C + J Sigma J^T)^-1 J Sigma B Sigma J^T), exa
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.calibration.identified.map_estimate import KinematicProblem, State, linearise
 from tomopose.calibration.model.ball_projection import projection_blocks, whiteners
@@ -48,10 +48,10 @@ def plan_kinematic(
     machine: ErrorModel,
     *,
     T_HT: RigidTransform,
-    balls: Any,
+    balls: ArrayLike,
     candidates: PoseSequence,
     scan: PoseSequence,
-    points: Any,
+    points: ArrayLike,
     n: int,
     sigma_px: float = 0.015,
     margin_px: float = MARGIN_PX,

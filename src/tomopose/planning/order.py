@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.geometry.rotations import rotation_angle_between
 from tomopose.manipulator.poses import PoseSequence
@@ -77,7 +76,7 @@ def ordered(poses: PoseSequence, limits: PlanLimits) -> PoseSequence:
     return rows_of(poses, [*tour, tour[0]])
 
 
-def rows_of(poses: PoseSequence, rows: Any) -> PoseSequence:
+def rows_of(poses: PoseSequence, rows: ArrayLike) -> PoseSequence:
     """Those rows as a sequence of set poses named p000, p001, ...; a row may come more than once."""
     index = np.asarray(rows, dtype=np.intp)
     alpha = np.zeros(len(poses)) if poses.alpha is None else poses.alpha

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.calibration.model.ball_projection import projection_blocks
 from tomopose.calibration.model.parameters import FreeParameters
@@ -37,7 +37,7 @@ class ScanTarget:
     M: Array
     names: tuple[str, ...]
 
-    def rms(self, covariance: Any) -> float:
+    def rms(self, covariance: ArrayLike) -> float:
         return float(np.sqrt(max(np.trace(self.M @ np.asarray(covariance)), 0.0)))
 
 
@@ -57,7 +57,7 @@ def scan_target(
     *,
     T_HT: RigidTransform,
     scan: PoseSequence | None = None,
-    points: Any = None,
+    points: ArrayLike | None = None,
     n_balls: int = 1,
     free: FreeParameters | None = None,
 ) -> ScanTarget:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.calibration.result import Calibration
 from tomopose.manipulator.poses import PoseSequence
@@ -102,5 +102,5 @@ def minutes(time_utc: tuple[str, ...] | None) -> Array | None:
         return None
 
 
-def finite_or_none(values: Any) -> list[float | None]:
+def finite_or_none(values: ArrayLike) -> list[float | None]:
     return [float(v) if np.isfinite(v) else None for v in np.asarray(values, dtype=np.float64)]

@@ -6,9 +6,10 @@ import math
 import re
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import SupportsFloat
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.units import MICROMETRES_PER_MM, MICRORADIANS_PER_RAD
 
@@ -76,7 +77,7 @@ def small_unit(u: float, unit: str) -> str:
     return f"{number(u * factor)} {name}".rstrip()
 
 
-def number(value: Any) -> str:
+def number(value: SupportsFloat) -> str:
     """A number with three figures, without an exponent where it is easy to read."""
     x = float(value)
     if not math.isfinite(x):
@@ -87,19 +88,19 @@ def number(value: Any) -> str:
     return f"{x:.{min(max(2 - exponent, 0), 8)}f}" if -5 <= exponent < 6 else f"{x:.3g}"
 
 
-def with_unit(value: Any, unit: str) -> str:
+def with_unit(value: SupportsFloat, unit: str) -> str:
     """A number with three figures and its unit; no unit where there is no number."""
     return f"{number(value)} {unit}" if math.isfinite(float(value)) else NOT_DETERMINABLE
 
 
-def decimals(values: Any) -> int:
+def decimals(values: ArrayLike) -> int:
     """Digits after the point that show three figures of the rms of values."""
     x = np.asarray(values, dtype=np.float64)
     rms = float(np.sqrt(np.mean(x**2))) if x.size else 0.0
     return max(0, 2 - math.floor(math.log10(rms))) if math.isfinite(rms) and rms > 0 else 3
 
 
-def cell(value: Any) -> str:
+def cell(value: object) -> str:
     """Any value of a result as the text of a table cell."""
     if value is None:
         return "–"

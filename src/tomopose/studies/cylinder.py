@@ -16,6 +16,8 @@ from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.errors import InputError
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
 from tomopose.geometry.scanner import Scanner
+from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.poses import PoseSequence
 from tomopose.reconstruction.run import reconstruct
 from tomopose.report.page import Figure
 from tomopose.report.style import ACCENT, ALERT, ORANGE, axis, layout
@@ -129,7 +131,7 @@ def cases_of(scale: Scale, seed: int) -> tuple[dict[str, tuple[Any, Any, dict[st
     scan, circle = scan_of(MAGNIFICATION, views), circular_scan(views)
     fine = run.scanner
 
-    def true(poses: Any, T_MH: Any) -> ProjectionMatrices:
+    def true(poses: PoseSequence, T_MH: RigidTransform) -> ProjectionMatrices:
         P = eq5_matrices(fine, T_HT=run.T_HT, T_MH=T_MH, alpha=poses.alpha)
         return ProjectionMatrices(
             P=P, n_u=fine.n_u, n_v=fine.n_v, p_u=fine.p_u, p_v=fine.p_v, pose_id=poses.pose_id, scanner=fine
@@ -154,7 +156,9 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
     found = {}
     for k, (name, (P_true, P_used, how)) in enumerate(cases.items()):
 
-        def surface(P_true: Any = P_true, P_used: Any = P_used, how: dict[str, Any] = how) -> dict[str, Any]:
+        def surface(
+            P_true: ProjectionMatrices = P_true, P_used: ProjectionMatrices = P_used, how: dict[str, Any] = how
+        ) -> dict[str, Any]:
             images = [cylinder_integrals(P, scanner).astype(np.float32) for P in P_true.P]
             volume = reconstruct(images, P_used, grid, images_are="line-integrals", engine="cpu", **how)
             return {"deviation": surface_deviation(volume)}

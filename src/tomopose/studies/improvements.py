@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.calibration.identified.calibrate import calibrate_kinematic
 from tomopose.calibration.projection_matrices import projection_matrices
@@ -93,7 +94,7 @@ def mixed_poses(rng: np.random.Generator, *, balls: int = 1, n: int = 189) -> Po
     )
 
 
-def hexapod_experiment(poses: Callable[[np.random.Generator], PoseSequence], balls: Any) -> Any:
+def hexapod_experiment(poses: Callable[[np.random.Generator], PoseSequence], balls: ArrayLike) -> Any:
     """A maker of experiments with the hexapod, by random generator."""
 
     def make(rng: np.random.Generator) -> Experiment:

@@ -11,10 +11,10 @@ met once like one that is met often, knows neither noise nor absorption, and tak
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numba import njit
+from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.units import Array
@@ -39,7 +39,7 @@ class Completeness:
         return int(self.share.argmin())
 
 
-def source_path(P: Any) -> Array:
+def source_path(P: ArrayLike) -> Array:
     """Source positions (n, 3), mm, in the object's frame (W at home), of matrices P (n, 3, 4): P [s, 1] = 0."""
     P = np.asarray(getattr(P, "P", P), dtype=np.float64)
     return -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[..., 0]

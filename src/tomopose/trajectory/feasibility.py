@@ -6,9 +6,9 @@ Each question has a function that answers it with arrays, and one that raises wh
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError, OutOfReachError, OutOfViewError, ShapeError
 from tomopose.geometry.frames import Frame
@@ -98,7 +98,7 @@ def cylinder(radius: float, z_low: float, z_high: float, *, corners: int = 64) -
     return np.vstack([np.column_stack([rim, np.full(corners, z)]) for z in (z_low, z_high)])
 
 
-def in_view(P: Any, x: Array, *, n_u: int, n_v: int, margin: float = 0.0) -> np.ndarray:
+def in_view(P: ArrayLike, x: Array, *, n_u: int, n_v: int, margin: float = 0.0) -> np.ndarray:
     """(n, m) bool: which of the points x (m, 3), mm, matrices P (n, 3, 4) put on the panel, `margin` px inside."""
     x_D = project(P, x)
     low, high = margin - 0.5, np.array([n_u, n_v]) - 0.5 - margin
@@ -106,7 +106,7 @@ def in_view(P: Any, x: Array, *, n_u: int, n_v: int, margin: float = 0.0) -> np.
         return np.asarray(((x_D >= low) & (x_D <= high)).all(axis=-1))
 
 
-def require_in_view(P: Any, x: Array, *, n_u: int, n_v: int, margin: float = 0.0) -> None:
+def require_in_view(P: ArrayLike, x: Array, *, n_u: int, n_v: int, margin: float = 0.0) -> None:
     """OutOfViewError, naming the views, where a point leaves the panel."""
     hidden = ~in_view(P, x, n_u=n_u, n_v=n_v, margin=margin)
     bad = np.flatnonzero(hidden.any(axis=1))

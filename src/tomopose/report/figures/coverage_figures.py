@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.calibration.result import Calibration
 from tomopose.geometry.projection import ProjectionMatrices
@@ -174,7 +175,7 @@ def table_angles(joined: Joined) -> Figure | None:
     )
 
 
-def correlation(covariance: Any) -> Array:
+def correlation(covariance: ArrayLike) -> Array:
     """Correlation matrix; NaN in rows that have no variance."""
     covariance = np.asarray(covariance, dtype=np.float64)
     variance = np.diag(covariance)

@@ -60,7 +60,15 @@ def neighbours_filled(values: Array, faces: np.ndarray) -> Array:
 
 
 @njit(cache=True)
-def _depth_buffer(x: Any, faces: Any, values: Any, shade: Any, depth: Any, value: Any, light: Any) -> None:
+def _depth_buffer(
+    x: np.ndarray,
+    faces: np.ndarray,
+    values: np.ndarray,
+    shade: np.ndarray,
+    depth: np.ndarray,
+    value: np.ndarray,
+    light: np.ndarray,
+) -> None:
     n_v, n_u = depth.shape
     for f in range(len(faces)):
         i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]

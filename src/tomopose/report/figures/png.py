@@ -5,9 +5,9 @@ from __future__ import annotations
 import base64
 import struct
 import zlib
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import ShapeError
 
@@ -18,7 +18,7 @@ def _chunk(kind: bytes, content: bytes) -> bytes:
     return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
 
-def grey_levels(image: Any, *, low: float = 0.5, high: float = 99.5) -> np.ndarray:
+def grey_levels(image: ArrayLike, *, low: float = 0.5, high: float = 99.5) -> np.ndarray:
     """8-bit grey values of an image between two percentiles; pixels that are not finite become black."""
     image = np.asarray(image, dtype=np.float64)
     finite = np.isfinite(image)

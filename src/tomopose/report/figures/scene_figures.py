@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.calibration.result import Calibration
 from tomopose.geometry.frames import Frame
@@ -21,7 +22,7 @@ CAMERA = {"eye": {"x": 1.1, "y": -1.9, "z": 0.9}, "center": {"x": 0, "y": 0, "z"
 NEAR_CAMERA = {"eye": {"x": 0.3, "y": -1.55, "z": 0.55}, "center": {"x": 0, "y": 0, "z": -0.04}}
 
 
-def _line(points: Any, colour: str, name: str = "", *, width: float = 3, dash: str = "solid") -> dict[str, Any]:
+def _line(points: ArrayLike, colour: str, name: str = "", *, width: float = 3, dash: str = "solid") -> dict[str, Any]:
     x = np.asarray(points, dtype=np.float64)
     return {
         "type": "scatter3d",
@@ -36,7 +37,7 @@ def _line(points: Any, colour: str, name: str = "", *, width: float = 3, dash: s
     }
 
 
-def _points(points: Any, name: str, **marker: Any) -> dict[str, Any]:
+def _points(points: ArrayLike, name: str, **marker: Any) -> dict[str, Any]:
     x = np.atleast_2d(np.asarray(points, dtype=np.float64))
     return {
         "type": "scatter3d",

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import ShapeError
 from tomopose.observations import BallObservations
@@ -49,7 +50,7 @@ class Thumbnail:
         object.__setattr__(self, "outline", float_array(np.reshape(self.outline, (-1, 2))))
 
 
-def ellipse_outline(centre: Any, semi_major: float, semi_minor: float, angle: float) -> Array:
+def ellipse_outline(centre: ArrayLike, semi_major: float, semi_minor: float, angle: float) -> Array:
     """Points (m, 2), px, of an ellipse whose major axis makes `angle` (rad) with the u axis, closed."""
     phase = np.linspace(0.0, 2.0 * np.pi, OUTLINE_POINTS)
     major = np.array([np.cos(angle), np.sin(angle)])
@@ -61,7 +62,7 @@ def ellipse_outline(centre: Any, semi_major: float, semi_minor: float, angle: fl
     )
 
 
-def thumbnail(observations: BallObservations, k: int, image: Any, *, text: str = "") -> Thumbnail:
+def thumbnail(observations: BallObservations, k: int, image: ArrayLike, *, text: str = "") -> Thumbnail:
     """The thumbnail of row k from its image [v, u] (whole frame, row index = v).
 
     Without a silhouette in the observations the crop is centred on the observed ball, or is the whole image.
@@ -105,7 +106,7 @@ def _span(middle: float, half: float, n: int) -> tuple[int, int]:
     return low, int(np.clip(np.ceil(middle + half) + 1, low + 1, n))
 
 
-def worst_first(d: Any, seen: Any) -> list[int]:
+def worst_first(d: ArrayLike, seen: ArrayLike) -> list[int]:
     """Row indices: those without a measurement first, then by falling d (px)."""
     d = np.where(np.asarray(seen, dtype=bool), np.nan_to_num(np.asarray(d, dtype=np.float64), nan=0.0), np.inf)
     return [int(i) for i in np.argsort(-d, kind="stable")]

@@ -6,7 +6,7 @@ import base64
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsFloat
 
 import numpy as np
 
@@ -25,7 +25,7 @@ USUAL_HEIGHT = 420
 MATPLOTLIB = "pip install matplotlib"
 
 
-def with_uncertainty(value: Any, u: Any) -> str:
+def with_uncertainty(value: SupportsFloat | None, u: SupportsFloat | None) -> str:
     """A value, with its standard uncertainty where there is one."""
     if value is None:
         return ABSENT
@@ -119,7 +119,7 @@ def _pyplot() -> Any:
     return plt
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     """A title of plotly's: a string or {"text": ...}."""
     return str(value.get("text", "")) if isinstance(value, Mapping) else str(value or "")
 

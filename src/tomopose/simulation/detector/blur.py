@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -39,7 +38,7 @@ def pixel_kernel(sigma: float, f: int, half: int) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _reduce_rows(cells: Any, k: Any, f: int, half: int, j_0: int, j_1: int, out: Any) -> None:
+def _reduce_rows(cells: np.ndarray, k: np.ndarray, f: int, half: int, j_0: int, j_1: int, out: np.ndarray) -> None:
     last = cells.shape[1] - 1
     for j in range(j_0, j_1):
         out[:, j, :] = 0.0
@@ -54,7 +53,7 @@ def _reduce_rows(cells: Any, k: Any, f: int, half: int, j_0: int, j_1: int, out:
 
 
 @njit(cache=True, nogil=True)
-def _reduce_columns(rows: Any, k: Any, f: int, half: int, j_0: int, j_1: int, out: Any) -> None:
+def _reduce_columns(rows: np.ndarray, k: np.ndarray, f: int, half: int, j_0: int, j_1: int, out: np.ndarray) -> None:
     last = rows.shape[2] - 1
     for j in range(j_0, j_1):
         for i in range(out.shape[1]):
@@ -65,7 +64,7 @@ def _reduce_columns(rows: Any, k: Any, f: int, half: int, j_0: int, j_1: int, ou
             out[j, i] = total
 
 
-def to_pixels(cells: Any, *, f: int, sigma_u: float, sigma_v: float, threads: int = 1) -> Array:
+def to_pixels(cells: np.ndarray, *, f: int, sigma_u: float, sigma_v: float, threads: int = 1) -> Array:
     """Pixel values (n_v, n_u) of cells (HELD, n_v f, n_u f; see `cells`) under a Gaussian blur of sigma_u,
     sigma_v px."""
     from tomopose.simulation.projector.view import in_bands

@@ -160,12 +160,12 @@ def fixed_pattern(detector: Detector, shape: tuple[int, int], seed: int) -> tupl
     return gain / detector.binning**2, dark / detector.binning**2, blocks(~dead, detector.binning) == 0
 
 
-def blocks(image: Any, b: int) -> Any:
+def blocks(image: np.ndarray, b: int) -> Any:
     """Sums over blocks of b x b pixels."""
     return image.reshape(image.shape[0] // b, b, image.shape[1] // b, b).sum(axis=(1, 3))
 
 
-def counted(signal: Array, detector: Detector, *, key: Any, threads: int) -> Any:
+def counted(signal: Array, detector: Detector, *, key: np.uint64, threads: int) -> Any:
     """Quanta (n_v, n_u) that a pixel reads, float32: Poisson numbers about signal x quanta, spread by the scintillator,
     summed over the detector pixels that are binned."""
     b = detector.binning

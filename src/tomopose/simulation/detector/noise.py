@@ -22,7 +22,7 @@ def frame_key(seed: int, frame: int, stream: int = 0) -> np.uint64:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _mix(key: Any, n: int) -> Any:
+def _mix(key: np.uint64, n: int) -> Any:
     x = key + (np.uint64(n) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -30,7 +30,7 @@ def _mix(key: Any, n: int) -> Any:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _two_normals(key: Any, n: int) -> Any:
+def _two_normals(key: np.uint64, n: int) -> Any:
     x = _mix(key, n)
     u = (np.float64(x >> np.uint64(32)) + 0.5) * 2.0**-32
     v = (np.float64(x & np.uint64(0xFFFFFFFF)) + 0.5) * 2.0**-32
@@ -40,7 +40,7 @@ def _two_normals(key: Any, n: int) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _few(key: Any, n: int, mean: float) -> float:
+def _few(key: np.uint64, n: int, mean: float) -> float:
     """A Poisson number by inversion, exact for small means."""
     u = (np.float64(_mix(key, n) >> np.uint64(11)) + 0.5) * 2.0**-53
     p = np.exp(-mean)
@@ -53,14 +53,14 @@ def _few(key: Any, n: int, mean: float) -> float:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _quanta(key: Any, n: int, mean: float, z: float) -> float:
+def _quanta(key: np.uint64, n: int, mean: float, z: float) -> float:
     if mean < FEW:
         return _few(key, n, mean) if mean > 0 else 0.0
     return mean + np.sqrt(mean) * z + (z * z - 1) / 6
 
 
 @njit(cache=True, nogil=True)
-def add_photon_noise(mean: Any, key: Any, v_0: int, v_1: int, out: Any) -> None:
+def add_photon_noise(mean: np.ndarray, key: np.uint64, v_0: int, v_1: int, out: np.ndarray) -> None:
     """Photon numbers `out` (n_v, n_u) with that mean, rows v_0 to v_1: Poisson, by the frame's key."""
     n_u = mean.shape[1]
     half = (n_u + 1) // 2
@@ -74,7 +74,7 @@ def add_photon_noise(mean: Any, key: Any, v_0: int, v_1: int, out: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def add_normal_noise(image: Any, sigma: float, key: Any, v_0: int, v_1: int) -> None:
+def add_normal_noise(image: np.ndarray, sigma: float, key: np.uint64, v_0: int, v_1: int) -> None:
     """Add white normal noise to rows v_0 to v_1 of an image, in place."""
     n_u = image.shape[1]
     half = (n_u + 1) // 2
@@ -87,7 +87,7 @@ def add_normal_noise(image: Any, sigma: float, key: Any, v_0: int, v_1: int) -> 
 
 
 @njit(cache=True, nogil=True)
-def digitise(signal: Any, gain: float, offset: float, top: float, v_0: int, v_1: int, out: Any) -> None:
+def digitise(signal: np.ndarray, gain: float, offset: float, top: float, v_0: int, v_1: int, out: np.ndarray) -> None:
     """Grey values of rows v_0 to v_1: round(offset + gain signal), held between 0 and `top`."""
     for v in range(v_0, v_1):
         for u in range(signal.shape[1]):
@@ -103,7 +103,7 @@ def _mirrored(k: int, n: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def spread_rows(image: Any, k: Any, v_0: int, v_1: int, out: Any) -> None:
+def spread_rows(image: np.ndarray, k: np.ndarray, v_0: int, v_1: int, out: np.ndarray) -> None:
     """Rows v_0 to v_1 of an image correlated with the odd kernel k along v, float32."""
     n_v, n_u = image.shape
     half = len(k) // 2
@@ -116,7 +116,7 @@ def spread_rows(image: Any, k: Any, v_0: int, v_1: int, out: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def spread_columns(image: Any, k: Any, mean: Any, v_0: int, v_1: int, out: Any) -> None:
+def spread_columns(image: np.ndarray, k: np.ndarray, mean: np.ndarray, v_0: int, v_1: int, out: np.ndarray) -> None:
     """mean + an image correlated with the odd kernel k along u, rows v_0 to v_1."""
     n_u = image.shape[1]
     half = len(k) // 2

@@ -44,7 +44,7 @@ class Glare:
 
 
 @njit(cache=True, nogil=True)
-def _block_means(image: Any, step: int, potential: bool, out: Any) -> None:
+def _block_means(image: np.ndarray, step: int, potential: bool, out: np.ndarray) -> None:
     """Means of step x step pixels of T, or of its scatter potential -T ln T."""
     n_v, n_u = image.shape
     for j in range(out.shape[0]):
@@ -63,7 +63,7 @@ def _block_means(image: Any, step: int, potential: bool, out: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _joined(image: Any, small: Any, step: int, own: float, share: float, constant: float) -> Any:
+def _joined(image: np.ndarray, small: np.ndarray, step: int, own: float, share: float, constant: float) -> Any:
     """own x image + share x the block means, interpolated between the blocks' middles, + constant."""
     n_v, n_u = image.shape
     out = np.empty(image.shape)
@@ -130,7 +130,7 @@ class MTF:
         object.__setattr__(self, "frequency", tuple(f.tolist()))
         object.__setattr__(self, "value", tuple(m.tolist()))
 
-    def at(self, f: Any) -> Array:
+    def at(self, f: Array) -> Array:
         last = self.frequency[-1] + (self.frequency[-1] - self.frequency[-2])
         return np.interp(f, np.append(self.frequency, last), np.append(self.value, 0.0))
 

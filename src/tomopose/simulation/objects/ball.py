@@ -3,9 +3,8 @@ centre and its silhouette's centre are projected."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import OutOfViewError
 from tomopose.geometry.frames import Frame
@@ -17,9 +16,9 @@ from tomopose.units import Array
 
 def ball_in_holder(
     *,
-    t: Any,
+    t: ArrayLike,
     ball_diameter: float = 8.0,
-    axis: Any = (0.0, 0.0, 1.0),
+    axis: ArrayLike = (0.0, 0.0, 1.0),
     tube_diameter: float | None = None,
     tube_length: float = 15.0,
     extension_diameter: float = 16.0,
@@ -41,7 +40,7 @@ def ball_in_holder(
     )
 
 
-def silhouette_centre(scanner: Scanner, x_S: Any, radius: float) -> Array:
+def silhouette_centre(scanner: Scanner, x_S: ArrayLike, radius: float) -> Array:
     r"""Centre (n, 2), px, of the ellipse that balls at x_S (n, 3) in S cast: not the projected ball centre.
 
     The silhouette is the cone x' (c c' - (c.c - r^2) 1) x = 0; with x = K^-1 (u, v, 1)' it is a conic Q of the
@@ -57,7 +56,9 @@ def silhouette_centre(scanner: Scanner, x_S: Any, radius: float) -> Array:
     return np.asarray(-np.linalg.solve(Q[:, :2, :2], Q[:, :2, 2:])[..., 0])
 
 
-def ball_positions(scanner: Scanner, *, T_HT: RigidTransform, T_MH: RigidTransform, t: Any, alpha: Any) -> Array:
+def ball_positions(
+    scanner: Scanner, *, T_HT: RigidTransform, T_MH: RigidTransform, t: ArrayLike, alpha: ArrayLike
+) -> Array:
     """Ball centres (n, 3) in S, mm: the chain of eq. (6) before the projection."""
     T_HT, T_MH = T_HT.require(Frame.H, Frame.T), T_MH.require(Frame.M, Frame.H)
     n = len(T_MH)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import EngineFailedError, EngineMissingError, FileError, InputError, ShapeError
 from tomopose.geometry.frames import Frame
@@ -65,7 +66,7 @@ class TriangleMesh:
             raise InputError(f"the mesh's faces look inwards (volume {self.volume:g} mm^3); turn them round")
         return self
 
-    def placed(self, *, R: Any = None, t: Any = (0.0, 0.0, 0.0)) -> TriangleMesh:
+    def placed(self, *, R: ArrayLike | None = None, t: ArrayLike = (0.0, 0.0, 0.0)) -> TriangleMesh:
         """The mesh after x -> R x + t (mm)."""
         R = np.eye(3) if R is None else np.asarray(R, dtype=np.float64)
         return TriangleMesh(vertices=self.vertices @ R.T + np.asarray(t, dtype=np.float64), faces=self.faces)

@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.frames import Frame
@@ -40,7 +40,7 @@ class Shape:
     def __sub__(self, other: Shape) -> Shape:
         return Joined(op=DIFFERENCE, a=self, b=other)
 
-    def placed(self, *, R: Any = None, t: Any = (0.0, 0.0, 0.0)) -> Shape:
+    def placed(self, *, R: ArrayLike | None = None, t: ArrayLike = (0.0, 0.0, 0.0)) -> Shape:
         """The shape after x -> R x + t (mm)."""
         R = np.eye(3) if R is None else np.asarray(R, dtype=np.float64)
         t = np.asarray(t, dtype=np.float64)
@@ -48,7 +48,7 @@ class Shape:
             raise ShapeError(f"a placement needs R (3, 3) and t (3,); got {R.shape} and {t.shape}")
         return self._placed(R, t)
 
-    def along(self, axis: Any, *, t: Any = (0.0, 0.0, 0.0)) -> Shape:
+    def along(self, axis: ArrayLike, *, t: ArrayLike = (0.0, 0.0, 0.0)) -> Shape:
         """The shape with its z axis turned to `axis` (3,) by the shortest rotation, then moved by t (mm)."""
         return self.placed(R=rotation_to(axis), t=t)
 
@@ -67,7 +67,7 @@ class Shape:
         raise NotImplementedError
 
 
-def rotation_to(axis: Any) -> Array:
+def rotation_to(axis: ArrayLike) -> Array:
     """The shortest rotation (3, 3) that takes e_z to the direction `axis`."""
     a = np.asarray(axis, dtype=np.float64)
     length = np.linalg.norm(a)

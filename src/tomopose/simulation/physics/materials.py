@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import EngineMissingError, InputError
 from tomopose.units import Array
@@ -139,7 +140,7 @@ MATERIALS: Mapping[str, Material] = MappingProxyType(
 """Materials by name; a scene may define more."""
 
 
-def attenuation(material: Material | str, energy: Any, *, materials: Mapping[str, Material] = MATERIALS) -> Array:
+def attenuation(material: Material | str, energy: ArrayLike, *, materials: Mapping[str, Material] = MATERIALS) -> Array:
     """Linear attenuation coefficient, 1/mm, at energies (n,), keV."""
     if isinstance(material, str):
         try:

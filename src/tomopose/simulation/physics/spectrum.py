@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import EngineMissingError, InputError, ShapeError
 from tomopose.simulation.physics.attenuation import tabulated
@@ -126,13 +127,16 @@ class Beam:
         """What `attenuated` takes."""
         return self.w, self.mu, *tabulated(self.w, self.mu)
 
-    def transmission(self, L: Any) -> Array:
+    def transmission(self, L: ArrayLike) -> Array:
         """Transmission (n,) of path lengths (n, m), mm."""
         return np.exp(-np.asarray(L) @ self.mu.T) @ self.w
 
 
 def condense(
-    spectrum: Spectrum, materials: tuple[str, ...], longest: Any, materials_table: Mapping[str, Material] = MATERIALS
+    spectrum: Spectrum,
+    materials: tuple[str, ...],
+    longest: ArrayLike,
+    materials_table: Mapping[str, Material] = MATERIALS,
 ) -> Beam:
     """A dozen energies that stand for the whole spectrum.
 

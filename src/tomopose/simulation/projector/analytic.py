@@ -10,8 +10,6 @@ each cell holds the quadratic surface nearest to the transmission (`cells`), so 
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numba import njit
 
@@ -40,7 +38,7 @@ from tomopose.simulation.projector.sampling import (
     lengths,
     work_space,
 )
-from tomopose.simulation.projector.view import View, Window, in_bands
+from tomopose.simulation.projector.view import Arrays, View, Window, in_bands
 from tomopose.units import Array
 
 FLAT = 2e-3
@@ -53,7 +51,7 @@ SMALL_PX = 8.0
 
 
 @njit(cache=True, nogil=True)
-def _crossing(c: Any, work: Any, u_0: float, v_0: float, u_1: float, v_1: float, mark: int) -> float:
+def _crossing(c: Arrays, work: Arrays, u_0: float, v_0: float, u_1: float, v_1: float, mark: int) -> float:
     """Where between two points (0 to 1) the surfaces seen change from those of signature `mark`, by halving."""
     lo, hi = 0.0, 1.0
     for _ in range(HALVINGS):
@@ -66,7 +64,9 @@ def _crossing(c: Any, work: Any, u_0: float, v_0: float, u_1: float, v_1: float,
 
 
 @njit(cache=True, nogil=True)
-def _split_cell(c: Any, work: Any, left: float, low: float, h: float, along_u: bool, marks: Any, M: Any) -> None:
+def _split_cell(
+    c: Arrays, work: Arrays, left: float, low: float, h: float, along_u: bool, marks: Arrays, M: np.ndarray
+) -> None:
     """Gather in M the moments of a cell that a steep edge crosses.
 
     x runs across the edge (along u or v), y along it; marks: signatures of the corners, m_xy.  The cell is cut at the
@@ -108,18 +108,18 @@ def _split_cell(c: Any, work: Any, left: float, low: float, h: float, along_u: b
 
 @njit(cache=True, nogil=True)
 def _cells(
-    c: Any,
+    c: Arrays,
     depth: int,
     u_0: int,
     v_0: int,
-    I: Any,
-    seen: Any,
+    I: np.ndarray,
+    seen: np.ndarray,
     f: int,
     j_0: int,
     j_1: int,
     weight: float,
-    out: Any,
-    rough: Any,
+    out: np.ndarray,
+    rough: np.ndarray,
 ) -> None:
     """Add weight x moments of the f x f cells of the pixels in rows j_0 to j_1 to `out` (HELD, rows, columns)."""
     work = work_space(c, depth)
@@ -203,7 +203,7 @@ def _without_small_parts(compiled: Compiled, boxes: Array) -> bool:
 
 
 def add_transmission(
-    out: Any,
+    out: np.ndarray,
     window: Window,
     compiled: Compiled,
     beam: Beam,

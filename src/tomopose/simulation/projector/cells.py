@@ -32,7 +32,7 @@ LATTICE_55, LATTICE_233 = fibonacci_lattice(55, 34), fibonacci_lattice(233, 144)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def gather_value(M: Any, value: float, x: float, y: float) -> None:
+def gather_value(M: np.ndarray, value: float, x: float, y: float) -> None:
     """Add a weighted value at (x, y), cell of side 1, to the moments M (6,)."""
     M[0] += value
     M[1] += value * x
@@ -44,7 +44,7 @@ def gather_value(M: Any, value: float, x: float, y: float) -> None:
 
 @njit(cache=True, nogil=True, inline="always")
 def add(
-    out: Any, row: int, column: int, m: float, m_u: float, m_v: float, m_uv: float, m_uu: float, m_vv: float
+    out: np.ndarray, row: int, column: int, m: float, m_u: float, m_v: float, m_uv: float, m_uu: float, m_vv: float
 ) -> None:
     out[0, row, column] += m
     out[1, row, column] += m_u
@@ -55,7 +55,9 @@ def add(
 
 
 @njit(cache=True, nogil=True)
-def add_moments(out: Any, row: int, column: int, weight: float, f: int, M: Any, xy: float, xx: float) -> None:
+def add_moments(
+    out: np.ndarray, row: int, column: int, weight: float, f: int, M: np.ndarray, xy: float, xx: float
+) -> None:
     """Add weight x the surface with moments M over a cell of side 1 / f.
 
     xy, xx: the points' own means of x y and x^2 (= y^2), 0 and 1/12 where they fill the cell.
@@ -74,7 +76,7 @@ def add_moments(out: Any, row: int, column: int, weight: float, f: int, M: Any, 
 
 
 @njit(cache=True, nogil=True)
-def _smooth(I: Any, seen: Any, j: int, i: int) -> bool:
+def _smooth(I: np.ndarray, seen: np.ndarray, j: int, i: int) -> bool:
     """Whether the pixel with lower corner (j, i) and its eight neighbours see the same surfaces, and no third
     difference between them exceeds `most`."""
     here = seen[j, i]
@@ -108,12 +110,12 @@ def bows(f: int) -> Any:
 
 @njit(cache=True, nogil=True)
 def fill_pixel(
-    out: Any,
+    out: np.ndarray,
     j: int,
     i: int,
     f: int,
     weight: float,
-    bow: Any,
+    bow: np.ndarray,
     f_00: float,
     f_01: float,
     f_10: float,
@@ -147,7 +149,9 @@ def fill_pixel(
 
 
 @njit(cache=True, nogil=True)
-def fill_smooth(I: Any, seen: Any, f: int, j_0: int, j_1: int, weight: float, out: Any, rough: Any) -> None:
+def fill_smooth(
+    I: np.ndarray, seen: np.ndarray, f: int, j_0: int, j_1: int, weight: float, out: np.ndarray, rough: np.ndarray
+) -> None:
     """Add weight x moments of the cells of smooth pixels in rows j_0 to j_1 to `out`; mark the others in `rough`."""
     bow = bows(f)
     for j in range(j_0, j_1):

@@ -16,7 +16,7 @@ FAR = 1.0e12
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _put(T: Any, S: Any, row: int, t_0: float, t_1: float, s_0: int, s_1: int) -> int:
+def _put(T: np.ndarray, S: np.ndarray, row: int, t_0: float, t_1: float, s_0: int, s_1: int) -> int:
     """Write one interval into a row of crossings; returns how many crossings that are (0 or 2)."""
     if t_1 > t_0:
         T[row, 0], T[row, 1], S[row, 0], S[row, 1] = t_0, t_1, s_0, s_1
@@ -42,7 +42,7 @@ def _slab(o: float, d: float, h: float, face: int, lo: float, hi: float, s_lo: i
 
 
 @njit(cache=True, nogil=True)
-def _root(c: Any, n: int, lo: float, hi: float) -> float:
+def _root(c: np.ndarray, n: int, lo: float, hi: float) -> float:
     """The root of the polynomial c[0] + c[1] t + ... of degree n between lo and hi, where its sign changes."""
     f_lo = c[n]
     for k in range(n - 1, -1, -1):
@@ -68,7 +68,17 @@ def _root(c: Any, n: int, lo: float, hi: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _torus(
-    ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, ring: float, tube: float, T: Any, S: Any, row: int
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    ring: float,
+    tube: float,
+    T: np.ndarray,
+    S: np.ndarray,
+    row: int,
 ) -> int:
     """Crossings of a torus, from an origin near it: the quartic's roots between its derivatives' roots."""
     b = ox * dx + oy * dy + oz * dz
@@ -112,10 +122,10 @@ def _torus(
 
 @njit(cache=True, nogil=True)
 def crossings(
-    kind: Any,
-    p: Any,
-    R: Any,
-    c: Any,
+    kind: np.ndarray,
+    p: np.ndarray,
+    R: np.ndarray,
+    c: np.ndarray,
     q: int,
     ox: float,
     oy: float,
@@ -123,8 +133,8 @@ def crossings(
     dx: float,
     dy: float,
     dz: float,
-    T: Any,
-    S: Any,
+    T: np.ndarray,
+    S: np.ndarray,
     row: int,
 ) -> int:
     """Crossings of primitive q with the ray o + t d: into row `row` of T (distances) and S (faces); how many (even)."""
@@ -172,7 +182,17 @@ def crossings(
 
 @njit(cache=True, nogil=True)
 def _cylinder(
-    ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, r: float, h: float, T: Any, S: Any, row: int
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    r: float,
+    h: float,
+    T: np.ndarray,
+    S: np.ndarray,
+    row: int,
 ) -> int:
     a = dx * dx + dy * dy
     lo, hi = -FAR, FAR
@@ -203,8 +223,8 @@ def _cone(
     r: float,
     h: float,
     slope: float,
-    T: Any,
-    S: Any,
+    T: np.ndarray,
+    S: np.ndarray,
     row: int,
 ) -> int:
     """Truncated cone, radius r + slope z for |z| <= h: convex, so one interval at most."""

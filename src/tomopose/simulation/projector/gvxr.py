@@ -85,7 +85,7 @@ def path_images(
 
 
 def add_gvxr_transmission(
-    out: Any,
+    out: np.ndarray,
     window: Window,
     bodies: list[tuple[TriangleMesh, str, Frame]],
     materials: tuple[str, ...],

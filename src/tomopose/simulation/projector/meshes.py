@@ -32,7 +32,7 @@ from tomopose.simulation.projector.cells import (
 from tomopose.simulation.projector.raster import fill, gather, projected, sample, touching
 from tomopose.simulation.projector.rays import LARGEST, Compiled
 from tomopose.simulation.projector.sampling import kernel_scene, lengths, work_space
-from tomopose.simulation.projector.view import View, Window, in_bands
+from tomopose.simulation.projector.view import Arrays, View, Window, in_bands
 
 FLAT, STEEP, STEEPEST = 2e-3, 2e-2, 0.1
 """How far the transmission over a pixel may lie from the bilinear one of its corners to count as flat; and from where
@@ -40,7 +40,7 @@ on the second and the third lattice are used."""
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _reach(c: Any, u: float, v: float) -> float:
+def _reach(c: Arrays, u: float, v: float) -> float:
     """Length (mm) of u U + v V + O - s: what one unit of q is worth."""
     s, O, U, V = c[10], c[11], c[12], c[13]
     x = O[0] + u * U[0] + v * V[0] - s[0]
@@ -50,7 +50,7 @@ def _reach(c: Any, u: float, v: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _transmission(c: Any, work: Any, Q: Any, L: Any, u: float, v: float) -> Any:
+def _transmission(c: Arrays, work: Arrays, Q: np.ndarray, L: np.ndarray, u: float, v: float) -> Any:
     """(transmission, signature of the solids) of a ray that has the signed q sums Q (m,) in the meshes."""
     signature = lengths(c, work, u, v)
     if signature == 0 and not Q.any():
@@ -62,7 +62,18 @@ def _transmission(c: Any, work: Any, Q: Any, L: Any, u: float, v: float) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _corners(c: Any, depth: int, P: Any, u_0: float, v_0: float, j_0: int, j_1: int, Q: Any, I: Any, seen: Any) -> bool:
+def _corners(
+    c: Arrays,
+    depth: int,
+    P: Arrays,
+    u_0: float,
+    v_0: float,
+    j_0: int,
+    j_1: int,
+    Q: np.ndarray,
+    I: np.ndarray,
+    seen: np.ndarray,
+) -> bool:
     """Transmission and signature of the samples in rows j_0 to j_1; False where a list of crossings overflowed."""
     work, L = work_space(c, depth), np.empty(Q.shape[2])
     fill(P, j_0, j_1, Q, seen)
@@ -77,21 +88,21 @@ def _corners(c: Any, depth: int, P: Any, u_0: float, v_0: float, j_0: int, j_1: 
 
 @njit(cache=True, nogil=True)
 def _rough_cells(
-    c: Any,
+    c: Arrays,
     depth: int,
-    P: Any,
+    P: Arrays,
     u_0: float,
     v_0: float,
-    I: Any,
-    rough: Any,
-    start: Any,
-    count: Any,
-    lists: Any,
+    I: np.ndarray,
+    rough: np.ndarray,
+    start: np.ndarray,
+    count: np.ndarray,
+    lists: np.ndarray,
     f: int,
     weight: float,
     j_0: int,
     j_1: int,
-    out: Any,
+    out: np.ndarray,
 ) -> None:
     """Add weight x moments of the cells of rough pixels in rows j_0 to j_1 to `out`."""
     work, h = work_space(c, depth), 1.0 / f
@@ -137,7 +148,7 @@ def _rough_cells(
 
 
 def add_mesh_transmission(
-    out: Any,
+    out: np.ndarray,
     window: Window,
     compiled: Compiled | None,
     meshes: tuple[MeshSolid, ...],

@@ -19,7 +19,7 @@ from tomopose.errors import OutOfViewError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.simulation.objects.mesh import MeshSolid, TriangleMesh
-from tomopose.simulation.projector.view import View, Window, in_bands
+from tomopose.simulation.projector.view import Arrays, View, Window, in_bands
 from tomopose.units import Array
 
 ROOM = 1e-6
@@ -75,7 +75,7 @@ def projected(
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _edge(x: Any, y: Any, a: int, b: int) -> Any:
+def _edge(x: np.ndarray, y: np.ndarray, a: int, b: int) -> Any:
     """(lower y, upper y, y, x, slope, direction) of the edge from a to b: x(y) = x + (y - y_a) slope, from the corner
     with the smaller number; direction 1 where it rises."""
     rises = 1.0 if y[b] > y[a] else -1.0
@@ -87,7 +87,7 @@ def _edge(x: Any, y: Any, a: int, b: int) -> Any:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _plane(x: Any, y: Any, h: Any, a: int, b: int, c: int) -> Any:
+def _plane(x: np.ndarray, y: np.ndarray, h: np.ndarray, a: int, b: int, c: int) -> Any:
     """(h at corner a, slopes along x and y, least and largest h) of a triangle."""
     area = (x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])
     h_x = h_y = 0.0
@@ -98,7 +98,7 @@ def _plane(x: Any, y: Any, h: Any, a: int, b: int, c: int) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def fill(P: Any, j_0: int, j_1: int, Q: Any, seen: Any) -> None:
+def fill(P: Arrays, j_0: int, j_1: int, Q: np.ndarray, seen: np.ndarray) -> None:
     """Signed sums of q (rows, columns, materials) and signatures of the grid's samples (i, j), rows j_0 to j_1."""
     x, y, h, faces, column, mark, sign = P
     n_u = Q.shape[1]
@@ -128,7 +128,9 @@ def fill(P: Any, j_0: int, j_1: int, Q: Any, seen: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def touching(P: Any, wanted: Any, j_0: int, j_1: int, count: Any, start: Any, lists: Any) -> None:
+def touching(
+    P: Arrays, wanted: np.ndarray, j_0: int, j_1: int, count: np.ndarray, start: np.ndarray, lists: np.ndarray
+) -> None:
     """Count, or where `lists` is not empty write down, the triangles that touch each wanted pixel of rows j_0 to j_1.
 
     A pixel (i, j) reaches from sample (i, j) to (i + 1, j + 1).
@@ -162,7 +164,7 @@ def touching(P: Any, wanted: Any, j_0: int, j_1: int, count: Any, start: Any, li
 
 
 @njit(cache=True, nogil=True)
-def gather(P: Any, triangles: Any, edges: Any, planes: Any, columns: Any) -> None:
+def gather(P: Arrays, triangles: np.ndarray, edges: np.ndarray, planes: np.ndarray, columns: np.ndarray) -> None:
     """What `sample` needs of the listed triangles: edges (k, 3, 6), planes (k, 11), columns (k,)."""
     x, y, h, faces, column, _, _ = P
     for k in range(len(triangles)):
@@ -179,7 +181,9 @@ def gather(P: Any, triangles: Any, edges: Any, planes: Any, columns: Any) -> Non
 
 
 @njit(cache=True, nogil=True)
-def sample(n: int, edges: Any, planes: Any, columns: Any, sign: float, x: float, y: float, Q: Any) -> None:
+def sample(
+    n: int, edges: np.ndarray, planes: np.ndarray, columns: np.ndarray, sign: float, x: float, y: float, Q: np.ndarray
+) -> None:
     """Add the signed q of n gathered triangles at (x, y) to Q (m,)."""
     for k in range(n):
         # x on an edge is rounded: the box leaves room for it.
@@ -223,7 +227,9 @@ def _reach(view: View, window: Window) -> tuple[Array, Array, Array]:
 
 
 @njit(cache=True, nogil=True)
-def _scale(Q: Any, along_u: Any, along_v: Any, twist: Any, v_0: int, j_0: int, j_1: int) -> None:
+def _scale(
+    Q: np.ndarray, along_u: np.ndarray, along_v: np.ndarray, twist: np.ndarray, v_0: int, j_0: int, j_1: int
+) -> None:
     """Sums of q times the length of what q counts, in place, rows j_0 to j_1; most pixels see no mesh."""
     for j in range(j_0, j_1):
         for i in range(Q.shape[1]):

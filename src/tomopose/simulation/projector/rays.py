@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit
+from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
@@ -40,13 +41,13 @@ class Compiled:
     of any primitive, mm.
     """
 
-    kind: Any
+    kind: np.ndarray
     p: Array
     R: Array
     t: Array
-    ops: Any
-    first: Any
-    material: Any
+    ops: np.ndarray
+    first: np.ndarray
+    material: np.ndarray
     materials: tuple[str, ...]
     centre: Array
     radius: Array
@@ -116,7 +117,7 @@ def compile_solids(solids: list[Solid] | tuple[Solid, ...]) -> Compiled:
 
 
 @njit(cache=True, nogil=True)
-def _combine(T: Any, S: Any, a: int, na: int, b: int, nb: int, op: int, out: int) -> int:
+def _combine(T: np.ndarray, S: np.ndarray, a: int, na: int, b: int, nb: int, op: int, out: int) -> int:
     """Merge rows a and b of crossings into row `out`: union (-1), intersection (-2) or difference (-3); -1 if too
     long."""
     i = j = n = 0
@@ -145,25 +146,25 @@ def _combine(T: Any, S: Any, a: int, na: int, b: int, nb: int, op: int, out: int
 
 @njit(cache=True, nogil=True)
 def trace(
-    kind: Any,
-    p: Any,
-    R: Any,
-    c: Any,
-    ops: Any,
-    first: Any,
-    material: Any,
-    centre: Any,
-    radius: Any,
-    active: Any,
+    kind: np.ndarray,
+    p: np.ndarray,
+    R: np.ndarray,
+    c: np.ndarray,
+    ops: np.ndarray,
+    first: np.ndarray,
+    material: np.ndarray,
+    centre: np.ndarray,
+    radius: np.ndarray,
+    active: np.ndarray,
     ox: float,
     oy: float,
     oz: float,
     dx: float,
     dy: float,
     dz: float,
-    T: Any,
-    S: Any,
-    L: Any,
+    T: np.ndarray,
+    S: np.ndarray,
+    L: np.ndarray,
 ) -> Any:
     """Path lengths of one ray, per material, into L (mm); returns the ray's signature, or -1 where a list overflowed.
 
@@ -236,7 +237,7 @@ def trace(
 
 
 @njit(cache=True, nogil=True)
-def _meet(centre: Any, radius: Any, o: Any, d: Any, active: Any) -> None:
+def _meet(centre: np.ndarray, radius: np.ndarray, o: np.ndarray, d: np.ndarray, active: np.ndarray) -> None:
     """Mark the solids that a bundle of rays can meet.
 
     Rays within the angle a of an axis pass a point at distance e from their origin, p from the axis, no nearer than
@@ -264,21 +265,21 @@ def _meet(centre: Any, radius: Any, o: Any, d: Any, active: Any) -> None:
 
 @njit(cache=True, nogil=True)
 def _trace_all(
-    kind: Any,
-    p: Any,
-    R: Any,
-    c: Any,
-    ops: Any,
-    first: Any,
-    material: Any,
-    centre: Any,
-    radius: Any,
-    o: Any,
-    d: Any,
+    kind: np.ndarray,
+    p: np.ndarray,
+    R: np.ndarray,
+    c: np.ndarray,
+    ops: np.ndarray,
+    first: np.ndarray,
+    material: np.ndarray,
+    centre: np.ndarray,
+    radius: np.ndarray,
+    o: np.ndarray,
+    d: np.ndarray,
     depth: int,
     lo: int,
     hi: int,
-    L: Any,
+    L: np.ndarray,
 ) -> int:
     """Path lengths of rays lo to hi into L; returns the number of a ray whose list overflowed, or -1."""
     T, S = np.empty((depth + 3, LARGEST)), np.empty((depth + 3, LARGEST + 1), dtype=np.int64)
@@ -316,8 +317,8 @@ def _trace_all(
 
 def path_lengths(
     solids: Compiled | list[Solid],
-    o: Any,
-    d: Any,
+    o: ArrayLike,
+    d: ArrayLike,
     T_FW: dict[Frame, RigidTransform] | None = None,
     *,
     threads: int = 1,

@@ -12,7 +12,7 @@ from tomopose.geometry.transforms import RigidTransform
 from tomopose.simulation.physics.attenuation import attenuated
 from tomopose.simulation.physics.spectrum import Beam
 from tomopose.simulation.projector.rays import LARGEST, Compiled, trace
-from tomopose.simulation.projector.view import View, shadow_boxes
+from tomopose.simulation.projector.view import Arrays, View, shadow_boxes
 
 BLOCK = 4
 """Between every fourth corner rays are interpolated where all around sees the same, smoothly."""
@@ -37,7 +37,7 @@ def kernel_scene(compiled: Compiled | None, beam: Beam, view: View, T_FW: dict[F
 
 
 @njit(cache=True, nogil=True)
-def work_space(c: Any, depth: int) -> Any:
+def work_space(c: Arrays, depth: int) -> Any:
     """(T, S, L, active) for `trace`: each band of rows has its own."""
     mu, boxes = c[9][1], c[14]
     return (
@@ -49,7 +49,7 @@ def work_space(c: Any, depth: int) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def lengths(c: Any, work: Any, u: float, v: float) -> Any:
+def lengths(c: Arrays, work: Arrays, u: float, v: float) -> Any:
     """The signature of the ray through pixel coordinates (u, v); its path lengths stand in work[2]."""
     kind, p, R, t, ops, first, material, centre, radius, _, s, O, U, V, boxes = c
     T, S, L, active = work
@@ -72,14 +72,16 @@ def lengths(c: Any, work: Any, u: float, v: float) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def at(c: Any, work: Any, u: float, v: float) -> Any:
+def at(c: Arrays, work: Arrays, u: float, v: float) -> Any:
     """(transmission, signature) at pixel coordinates (u, v)."""
     signature = lengths(c, work, u, v)
     return 1.0 if signature == 0 else attenuated(c[9], work[2]), signature
 
 
 @njit(cache=True, nogil=True)
-def coarse_corners(c: Any, depth: int, u_0: int, v_0: int, mask: Any, j_0: int, j_1: int, I: Any, seen: Any) -> None:
+def coarse_corners(
+    c: Arrays, depth: int, u_0: int, v_0: int, mask: np.ndarray, j_0: int, j_1: int, I: np.ndarray, seen: np.ndarray
+) -> None:
     """Every BLOCK-th corner, rows j_0 to j_1 of them; seen is 0 where nothing is met, or less than may be met."""
     work = work_space(c, depth)
     for j in range(j_0, j_1):
@@ -95,7 +97,7 @@ def coarse_corners(c: Any, depth: int, u_0: int, v_0: int, mask: Any, j_0: int, 
 
 
 @njit(cache=True, nogil=True)
-def _even(I: Any, seen: Any, j: int, i: int) -> bool:
+def _even(I: np.ndarray, seen: np.ndarray, j: int, i: int) -> bool:
     """Whether cubic interpolation between coarse corners (j, i) and (j + 1, i + 1) stands for the rays there."""
     if j < 1 or i < 1 or j + 2 >= I.shape[0] or i + 2 >= I.shape[1] or seen[j, i] == 0:
         return False
@@ -113,17 +115,17 @@ def _even(I: Any, seen: Any, j: int, i: int) -> bool:
 
 @njit(cache=True, nogil=True)
 def all_corners(
-    c: Any,
+    c: Arrays,
     depth: int,
     u_0: int,
     v_0: int,
-    mask: Any,
-    rough: Any,
-    rough_seen: Any,
+    mask: np.ndarray,
+    rough: np.ndarray,
+    rough_seen: np.ndarray,
     j_0: int,
     j_1: int,
-    I: Any,
-    seen: Any,
+    I: np.ndarray,
+    seen: np.ndarray,
 ) -> bool:
     """Transmission and signature at the pixels' corners, rows j_0 to j_1; False where a list overflowed.
 

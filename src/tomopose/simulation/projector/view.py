@@ -8,12 +8,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import OutOfViewError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
+
+Arrays = tuple[Any, ...]
+"""What kernels take as one value: arrays, and tuples of arrays, of mixed types.  numba infers each."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +30,7 @@ class View:
     V: Array
 
     @classmethod
-    def of(cls, scanner: Scanner, source_shift: Any = (0.0, 0.0, 0.0)) -> View:
+    def of(cls, scanner: Scanner, source_shift: ArrayLike = (0.0, 0.0, 0.0)) -> View:
         """The scanner's view; source_shift (3,) mm moves the source in S against the panel (focal spot)."""
         U, V, O = scanner.panel
         T_SW = scanner.T_WS.inv

@@ -11,9 +11,8 @@ in mm, with semi-minor axis b and d_SD:  m = c / (1 + b^2 / d_SD^2).
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter, sobel
 
 from tomopose.errors import BallNotFoundError
@@ -28,7 +27,7 @@ ROUNDS = 3
 FEWEST = 24
 
 
-def edge_pixels(image: Any) -> tuple[Array, Array]:
+def edge_pixels(image: ArrayLike) -> tuple[Array, Array]:
     """u, v (n,): pixels where the gradient is strong and largest across the edge.  image[v, u]."""
     smooth = gaussian_filter(np.asarray(image, dtype=np.float64), SMOOTHING_PX, mode="nearest")
     g_u, g_v = sobel(smooth, axis=1), sobel(smooth, axis=0)
@@ -78,7 +77,7 @@ def corrected_centre(scanner: Scanner, centre: Array, semi_minor_mm: float) -> A
     return np.asarray(piercing + (centre - piercing) / (1 + (semi_minor_mm / scanner.d_SD) ** 2))
 
 
-def ellipse_method(image: Any, scanner: Scanner, *, origin: tuple[int, int] = (0, 0)) -> Array:
+def ellipse_method(image: ArrayLike, scanner: Scanner, *, origin: tuple[int, int] = (0, 0)) -> Array:
     """Projected centre of the ball (2,), px in D, by the paper's method; a detector without tilts.
 
     image:  a crop [v, u] around the ball, which is darker than what surrounds it.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numba import njit
 
@@ -37,7 +35,15 @@ def ball_paths(P: Array, centres: Array, radii: Array, shaft_radius: float, bott
 
 
 @njit(cache=True, nogil=True)
-def _add_balls(P: Any, inverse: Any, centres: Any, radii: Any, shaft: float, bottom: Any, out: Any) -> None:
+def _add_balls(
+    P: np.ndarray,
+    inverse: np.ndarray,
+    centres: np.ndarray,
+    radii: np.ndarray,
+    shaft: float,
+    bottom: np.ndarray,
+    out: np.ndarray,
+) -> None:
     n_v, n_u = out.shape
     s = -(inverse @ np.ascontiguousarray(P[:, 3]))
     for m in range(len(centres)):

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.measurement.features.measurands import maximum_permissible_error
 from tomopose.measurement.mesh.mesh import Mesh
@@ -39,11 +40,11 @@ def verdict(theirs: float, ours: float) -> str:
     return f"ours is better, {1 / ratio:.2g} x smaller" if ratio < 1 else f"OURS IS WORSE, {ratio:.2g} x larger"
 
 
-def rms(values: Any) -> float:
+def rms(values: ArrayLike) -> float:
     return float(np.sqrt(np.nanmean(np.asarray(values, dtype=np.float64) ** 2)))
 
 
-def largest(values: Any) -> float:
+def largest(values: ArrayLike) -> float:
     return float(np.nanmax(np.abs(np.asarray(values, dtype=np.float64))))
 
 
@@ -64,7 +65,7 @@ def waves(deviation: Array, phi: Array, n: int = 20) -> Array:
     return np.asarray(2 * np.abs(phase @ deviation[good]) / good.sum())
 
 
-def limit(length: Any) -> Array:
+def limit(length: ArrayLike) -> Array:
     """MPE, um, at lengths (n,), mm."""
     return np.array([maximum_permissible_error(float(x), MPE_A_UM, MPE_K, None) for x in np.atleast_1d(length)])
 
