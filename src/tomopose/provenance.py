@@ -1,4 +1,4 @@
-"""Provenance: what made a result.  A block of it stands in every file that tomopose writes."""
+"""Provenance: what made a result.  A block of it is in every file that tomopose writes."""
 
 from __future__ import annotations
 

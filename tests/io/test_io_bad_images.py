@@ -172,7 +172,7 @@ def test_two_formats_in_one_place_are_refused(folder):
 
 
 def test_one_image_twice_is_refused(folder):
-    with pytest.raises(InputError, match="stands more than once"):
+    with pytest.raises(InputError, match="appears more than once"):
         open_images([folder / "pose_0.tif", folder / "pose_0.tif"])
 
 

@@ -276,7 +276,7 @@ def test_duplicate_images_are_refused_unless_the_ball_differs(table):
 
 
 def test_a_repeated_column_is_refused(table):
-    with pytest.raises(InputError, match="column 'x_mm' stands more than once"):
+    with pytest.raises(InputError, match="column 'x_mm' appears more than once"):
         read_poses(table(GOOD.replace("y_mm", "x_mm")))
 
 

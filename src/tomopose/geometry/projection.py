@@ -69,7 +69,7 @@ def eq5_matrices(
 ) -> Array:
     """The matrices P_j (n, 3, 4) that take points of W, object at home, to pixels.  Eq. (5).
 
-    Home is table angle 0 and manipulator at zero, so that x_W0 = home x_M; the printed T_HT^-1 of eq. (5) stands for
+    Home is table angle 0 and manipulator at zero, so that x_W0 = home x_M; the printed T_HT^-1 of eq. (5) denotes
     the inverse of (T_TW,0 T_HT T_MH,0) with two identities.  home: another T_MH,0, such as a robot's working pose,
     whose zero is far from the scanner.  |P[2, :3]| = 1 and w is the depth in mm.
     """
@@ -91,8 +91,8 @@ def eq5_matrices(
 def canonical(P: ArrayLike, in_front: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
     """P scaled to |P[2, :3]| = 1 with w > 0 at the point `in_front` of W, mm.
 
-    The origin is the field's convention (P[2, 3] > 0).  A robot that stands behind the source puts the origin of W at
-    home there too; a point of its object then tells the sign.
+    The origin is the field's convention (P[2, 3] > 0).  A robot that is behind the source puts the origin of W at
+    home there too; a point of its object then gives the sign.
     """
     P = np.asarray(P, dtype=np.float64)
     if P.shape[-2:] != (3, 4):

@@ -39,7 +39,7 @@ class RigidTransform:
             error = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max()
             if error > ORTHONORMAL_TOLERANCE or (np.linalg.det(R) < 0).any():
                 raise InputError(
-                    f"R of T_{self.source.name}{self.target.name} is no proper rotation "
+                    f"R of T_{self.source.name}{self.target.name} is not a proper rotation "
                     f"(R R^T differs from 1 by {error:.2g}, smallest determinant {np.linalg.det(R).min():.3g})"
                 )
         object.__setattr__(self, "R", R)

@@ -128,7 +128,7 @@ def read_table(path: str | Path) -> TextTable:
         raise InputError(f"{path} holds no rows" if header else f"{path} holds no header line")
     twice = [name for name, count in Counter(header).items() if count > 1]
     if twice:
-        raise InputError(f"{path}: column {twice[0]!r} stands more than once")
+        raise InputError(f"{path}: column {twice[0]!r} appears more than once")
     return TextTable(
         path=path,
         comments=comments,

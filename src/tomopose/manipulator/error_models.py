@@ -1,4 +1,4 @@
-"""Identified errors at work: where the real plate stands for any pose table, and what to command instead.
+"""Identified errors at work: where the real plate is for any pose table, and what to command instead.
 
 `Calibration.manipulator` (and calibration.json) hold a machine with the errors that were found:
 
@@ -38,7 +38,7 @@ from tomopose.manipulator.serial import SerialRobot
 from tomopose.units import Array
 
 MOVING_SCANNER = "moving-scanner"
-"""Block's "arrangement" where source and detector move and the object stands still."""
+"""Block's "arrangement" where source and detector move and the object does not move."""
 RANGE_MARGIN = 0.1
 """Of the calibrated range's width: as far outside a pose still counts as inside."""
 COMMAND_STEPS = 30
@@ -143,7 +143,7 @@ def machines_of(manipulator: Mapping[str, Any]) -> tuple[ErrorModel | None, Erro
 def _executed(
     manipulator: Mapping[str, Any], poses: PoseSequence, moves: PoseSequence
 ) -> tuple[RealPoses, tuple[str, ...]]:
-    """Where the real plate stands for commanded poses, with lags as of the table `moves`, and the errors' names."""
+    """Where the real plate is for commanded poses, with lags as of the table `moves`, and the errors' names."""
     model, p = model_from_block(manipulator)
     lag = manipulator.get("lag")
     if lag is None:

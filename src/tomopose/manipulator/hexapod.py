@@ -13,7 +13,7 @@ so that with A the 6x6 matrix of rows ((R p_k x n_k)^T, n_k^T)
 which gives both Newton's step of the forward kinematics and the exact Jacobian by the errors.
 
 Two errors that lie before the legs are optional: the axes about which the controller turns may be rotated by exp(c)
-against those along which it shifts, and the pivot may stand q away from where the controller believes it to be.
+against those along which it shifts, and the pivot may be q away from where the controller believes it to be.
 
 Source: the constraint equations of the Stewart-Gough platform, e.g. Merlet, Parallel Robots (Springer 2006), ch. 2, 3.
 """
@@ -172,7 +172,7 @@ class Hexapod:
         return R, t
 
     def real_poses(self, poses: PoseSequence, p: Array) -> RealPoses:
-        """Where the real plate stands for commanded `poses`, and its derivative by the errors p.
+        """Where the real plate is for commanded `poses`, and its derivative by the errors p.
 
         Raises OutOfReachError for poses that the real platform cannot reach or whose nominal legs leave the limits,
         TrajectoryError for singular poses; both name the indices.

@@ -1,7 +1,7 @@
-r"""The other arrangement: the manipulator carries source and detector, the object stands still (C-arm, gantry).
+r"""The other arrangement: the manipulator carries source and detector, the object does not move (C-arm, gantry).
 
-The chain of eq. (6) then runs through the *inverse* pose.  With H the manipulator's base, in which the ball stands, and
-M the moved plate, which carries the scanner,
+The chain of eq. (6) then runs through the *inverse* pose.  With H the manipulator's base, in which the ball is fixed,
+and M the moved plate, which carries the scanner,
 
     x_D = P_S T_WS T_MT T_MH^-1 (t; 1),     t the ball in H,  T_MT the mount of the scanner on the plate,
 
@@ -30,9 +30,9 @@ def _inverse(T: RigidTransform) -> RigidTransform:
 
 
 def inverse_poses(poses: PoseSequence) -> PoseSequence:
-    """The table for the chain above: T_MH^-1 stands in the place of T_MH.  Twice gives the table back.
+    """The table for the chain above: T_MH^-1 is in the place of T_MH.  Twice gives the table back.
 
-    M then names what stands still with the ball, H what moves with the scanner.
+    M then names what does not move with the ball, H what moves with the scanner.
     """
     return replace(
         poses,

@@ -1,6 +1,6 @@
 r"""A smooth map of pose errors for manipulators whose kinematics nobody knows.
 
-The real plate stands off its commanded pose (R, t) by a turn w and a shift s in H that are polynomials of low order in
+The real plate is off its commanded pose (R, t) by a turn w and a shift s in H that are polynomials of low order in
 the six pose coordinates x = (t / t_scale, log R / w_scale):
 
     (w, s) = sum_j c_j phi_j(x),   phi = x_i (order 1), and x_i x_j (order 2).
@@ -95,7 +95,7 @@ class PoseMap:
         return np.stack([np.prod(x[:, list(term)], axis=1) for term in self._terms], axis=1)
 
     def real_poses(self, poses: PoseSequence, p: Array) -> RealPoses:
-        """Where the real plate stands for commanded `poses`, and its derivative by the coefficients p."""
+        """Where the real plate is for commanded `poses`, and its derivative by the coefficients p."""
         p = np.asarray(p, dtype=np.float64)
         phi = self.features(poses)
         if p.shape != (6 * phi.shape[1],):

@@ -1,4 +1,5 @@
-"""Pose sequences: what the manipulator was told and where its encoders say it stood.  T_MH of eqs. (3) and (6)."""
+"""Pose sequences: the commanded poses of the manipulator and those that its encoders report.  T_MH of eqs. (3) and
+(6)."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ class ErrorModel(Protocol):
     def repeatability(self) -> Repeatability: ...
 
     def real_poses(self, poses: PoseSequence, p: Array) -> RealPoses:
-        """Where the real plate stands when the controller is told `poses` and the machine has the errors p."""
+        """Where the real plate is when `poses` are commanded and the machine has the errors p."""
         ...
 
     def resized(self, sizes: Array) -> ErrorModel:

@@ -92,7 +92,7 @@ class WithRunEffects:
 
     @property
     def drift(self) -> slice:
-        """Where the drift stands in p; the lags follow it."""
+        """Where the drift is in p; the lags follow it."""
         m = len(self.machine.names)
         return slice(m, m + DRIFT_ORDER * len(COORDINATES))
 

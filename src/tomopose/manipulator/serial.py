@@ -4,7 +4,7 @@ r"""Serial robots: chains of joints in Denavit-Hartenberg parameters, with the e
     modified-dh:  T_k = Rot_x(alpha_k) Trans_x(a_k) Rot_z(theta_k) Trans_z(d_k)      (a, alpha of the link before)
 
 and T_MH = T_1 ... T_m T_tool, theta_k = q_k + offset_k for a turning joint, d_k = d_k + q_k for a sliding one.  For
-nearly parallel neighbours a small turn beta about y stands after T_k (Hayati), since DH parameters jump there.
+nearly parallel neighbours a small turn beta about y follows T_k (Hayati), since DH parameters jump there.
 The gear of joint k adds e_cos cos q_k + e_sin sin q_k (an eccentric wheel) to its angle.
 
 The controller works with the nominal chain.  What a joint does to the plate is a screw along its z or x axis; the
@@ -308,7 +308,7 @@ class SerialRobot:
         return q, extra[0]
 
     def real_poses(self, poses: PoseSequence, p: Array) -> RealPoses:
-        """Where the real flange stands for commanded `poses`, and its derivative by the errors p."""
+        """Where the real flange is for commanded `poses`, and its derivative by the errors p."""
         q, extra = self.joint_values(poses)
         T, _, J = self.chain(q, p)
         arm = np.einsum("nij,j->ni", T[:, :3, :3], extra[:3, 3])

@@ -1,13 +1,13 @@
-r"""Twin robots: one carries the source, the other the detector, the object stands still.
+r"""Twin robots: one carries the source, the other the detector, the object does not move.
 
-With H the flange of the detector's robot and M its base, in which the ball stands, the tables hold inverse poses as for
-every moving scanner (see `inverse`).  The focal spot, fixed at `focus` on the flange of the source's robot, stands in M
+With H the flange of the detector's robot and M its base, in which the ball is fixed, the tables hold inverse poses as
+for every moving scanner (see `inverse`).  The focal spot, fixed at `focus` on the flange of the source's robot, is in M
 at
 
     x_k = R_B (R_k focus + t_k) + t_B,
 
-(R_k, t_k) the flange of the source's robot in its own base, (R_B, t_B) that base in M.  How the bases stand to each
-other and where the focal spot sits are known roughly; they are unknowns beside the errors of both machines.
+(R_k, t_k) the flange of the source's robot in its own base, (R_B, t_B) that base in M.  How the bases are placed to
+each other and where the focal spot sits are known roughly; they are unknowns beside the errors of both machines.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class TwinRobots:
         return replace(real, J=J)
 
     def source_places(self, poses: PoseSequence, p: Array) -> SourcePlaces:
-        """Where the focal spot stands in M, in the views of `poses`."""
+        """Where the focal spot is in M, in the views of `poses`."""
         own, other, setup = self._split(p)
         rows = self.source_poses.select(self.source_poses.index_of(poses.pose_id))
         R, t, J_machine = rows.T_MH.R, rows.T_MH.t, np.zeros((len(rows), 6, 0))

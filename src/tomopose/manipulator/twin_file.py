@@ -1,4 +1,4 @@
-"""twin.json: two robots, one with the source, one with the detector, as they stand in the drawing.
+"""twin.json: two robots, one with the source, one with the detector, as they are in the drawing.
 
     {"schema": "tomopose/twin/1",
      "detector": "robot.json",             the robot's file beside this one, its content, or null: it is trusted
@@ -58,7 +58,7 @@ BASE_KEYS, PANEL_KEYS = ("t_mm", "angles_deg", "sigma_t_mm", "sigma_deg"), ("ori
 SQUARE = 1e-3
 """Largest cosine between the panel's axes."""
 NEAREST_BASES_MM = 20.0
-"""Two robots whose bases stand nearer to each other are drawn in metres."""
+"""Two robots whose bases are nearer to each other are drawn in metres."""
 CONFIRM = 'convert them, or add "units": "confirmed" if the numbers are right'
 
 
@@ -131,10 +131,12 @@ def twin_drawing(document: Mapping[str, Any], where: str, *, folder: Path | None
         if any(abs(abs(a) - k * np.pi / 2) < 1e-3 for a in angles for k in (1, 2, 3)):
             raise UnitError(f"{where}: base: angles_deg {angles.tolist()} hold a multiple of pi/2, radians? {CONFIRM}")
         if 0 < np.linalg.norm(t) < NEAREST_BASES_MM:
-            raise UnitError(f"{where}: base: the bases stand {np.linalg.norm(t):.4g} mm apart, metres? {CONFIRM}")
+            raise UnitError(f"{where}: base: the bases are {np.linalg.norm(t):.4g} mm apart, metres? {CONFIRM}")
     u, v = (_direction(panel[k], f"{where}: panel: {k}") for k in PANEL_KEYS[1:])
     if abs(u @ v) > SQUARE:
-        raise InputError(f"{where}: panel: u_axis and v_axis stand at {np.degrees(np.arccos(u @ v)):.4g} deg, not 90")
+        raise InputError(
+            f"{where}: panel: u_axis and v_axis form an angle of {np.degrees(np.arccos(u @ v)):.4g} deg, not 90"
+        )
     v = v - (u @ v) * u
     machines = {who: _machine(document[who], f"{where}: {who}", folder) for who in ("detector", "source")}
     return TwinDrawing(

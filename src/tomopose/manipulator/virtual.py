@@ -101,7 +101,7 @@ class Disturbance:
 def lag_of_backlash(x: Array, play: float) -> Array:
     """(n, k), mm: how far axes lag behind commanded positions x (n, k), in order, with that play.
 
-    The drive pushes one flank: after a move in + an axis stands play/2 short, after a move in - play/2 beyond; an axis
+    The drive pushes one flank: after a move in + an axis is play/2 short, after a move in - play/2 beyond; an axis
     that does not move keeps its flank, and all begin on that of a move in +.
     """
     return -0.5 * play * last_direction(np.concatenate([x[:1] - 1.0, x]), 0.0)[1:]
@@ -115,7 +115,7 @@ def real_motion(
     disturbance: Disturbance | None = None,
     rng: np.random.Generator | None = None,
 ) -> PoseSequence:
-    """Where the real plate stands in each pose of the table: the truth of a virtual experiment.
+    """Where the real plate is in each pose of the table: the truth of a virtual experiment.
 
     rng: needed where the disturbance scatters; without a disturbance the motion is exact.
     """

@@ -22,7 +22,7 @@ def _alpha(poses: PoseSequence) -> Array:
 
 
 def _table_lines(poses: PoseSequence, comment: str) -> list[list[str]]:
-    """For every pose, the comment lines that stand before it."""
+    """For every pose, the comment lines before it."""
     alpha = _alpha(poses)
     lines: list[list[str]] = []
     for k, a in enumerate(alpha):

@@ -31,7 +31,8 @@ SIGMA_PX = 0.0207 / np.sqrt(2.0)
 """Standard uncertainty of a coordinate of a centre: the paper's d_rms of 0.0207 px counts both (eq. 8)."""
 
 BALL_MM = (10.0, -8.0, 16.0)
-"""A ball 20 mm off the pivot in no special direction: on the pivot, rotations could not be told from one another."""
+"""A ball 20 mm off the pivot in no special direction: on the pivot, rotations could not be distinguished from one
+another."""
 
 TRADED = 0.5
 """Share of the largest weight in an undetermined direction from which a coordinate is named: the coordinates that trade
@@ -49,7 +50,7 @@ class PosePlan:
     reference:   the same of the paper's 189 poses under the same noise, table still.
     u:           predicted standard uncertainties by coordinate of the calibration's tangent (mm, rad, px).
     covariance:  (m, m) of all.
-    resolved:    which rival conventions these poses would show, or None where it was not asked for.
+    resolved:    which alternative conventions these poses would show, or None where it was not asked for.
     duration:    s.
     """
 
@@ -146,8 +147,8 @@ def plan_poses(
                (default: the paper's tilted scan, eq. (11), and a box of +-15, +-15, +-30 mm).
     free, priors: scanner parameters to be estimated too, as in `calibrate`.
     criterion: "A": the scan reprojection error itself;  "D": the volume of the confidence region.
-    resolve:   also see to it that the poses show every rival convention that these limits let them show, by 5 sigma,
-               and find which they would not.
+    resolve:   also see to it that the poses show every alternative convention that these limits let them show, by 5
+               sigma, and find which they would not.
 
     Raises
     ------
@@ -206,7 +207,7 @@ def plan_poses(
             must += more
             other, other_chosen = design()
             better = resolvability(scanner, other, **given)
-            # poses forced in for a rival that they do not help against only cost accuracy
+            # poses forced in for an alternative that they do not help against only cost accuracy
             if better.score <= resolved.score and _least(better) <= 1.1 * _least(resolved):
                 break
             poses, chosen, resolved = other, other_chosen, better
@@ -224,7 +225,7 @@ def plan_poses(
 
 
 def _least(resolved: Resolvability) -> float:
-    """The smallest rise of chi2 by a rival that is not told."""
+    """The smallest rise of chi2 by an alternative that these poses do not show."""
     return min((h.delta for h in resolved.unresolved), default=np.inf)
 
 

@@ -118,7 +118,7 @@ def scan_jacobian(
 ) -> Array:
     """(rows, m): how the scan's pixels answer to (w_HT, t_HT, balls, errors), the object's rigid pose removed.
 
-    The machine stands at zero errors; m is the number of unknowns, errors last.
+    The machine is at zero errors; m is the number of unknowns, errors last.
     """
     real = machine.real_poses(scan, np.zeros(len(machine.names)))
     J = np.zeros((len(points), len(scan), 2, m))

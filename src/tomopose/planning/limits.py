@@ -23,7 +23,7 @@ def _paper_travel() -> TravelLimits:
 @dataclass(frozen=True, kw_only=True)
 class PlanLimits:
     """travel:        of the manipulator's axes (default +-10 mm and +-5 degrees, the paper's).
-    table_angles:  rad, the angles the table may stand at; (0,) keeps it still.
+    table_angles:  rad, the angles that the table may take; (0,) keeps it still.
     ball_radius:   mm;  margin: px that the whole ball keeps from the panel's edge.
     magnification: (least, most) of the ball, or None.
     moved_points:  (p, 3) mm in M, of what moves with the plate;  boxes: (low, high) pairs, mm in W, none may enter.

@@ -59,7 +59,7 @@ def run_time(poses: PoseSequence, limits: PlanLimits) -> float:
 
 
 def ordered(poses: PoseSequence, limits: PlanLimits) -> PoseSequence:
-    """The poses in a short order, named p000, p001, ...; begins and ends with a pose that stands in them twice.
+    """The poses in a short order, named p000, p001, ...; begins and ends with a pose that is in them twice.
 
     Where none does, the pose nearest to home is taken once more.
     """

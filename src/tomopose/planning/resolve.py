@@ -1,4 +1,4 @@
-"""Would these poses show a wrong convention?  Every rival is fitted to the exact centres of the planned poses.
+"""Would these poses show a wrong convention?  Every alternative is fitted to the exact centres of the planned poses.
 
 Where one would pass, the poses that tell it best are those at which its best fit to the plan is farthest from the truth
 (T-optimality: Atkinson and Fedorov, Biometrika 62 (1975) 57); the plan is made again with such poses in it.
@@ -28,8 +28,8 @@ from tomopose.units import Array
 
 @dataclass(frozen=True, kw_only=True)
 class Resolvability:
-    """diagnosis: all rivals;  unresolved: those whose chi2 would not rise by 25 (5 sigma), true symmetries apart;
-    symmetric: the true symmetries among them;  score: part of the other rivals that would be told apart;
+    """diagnosis: all alternatives;  unresolved: those whose chi2 would not rise by 25 (5 sigma), true symmetries apart;
+    symmetric: the true symmetries among them;  score: part of the other alternatives that would be distinguished;
     still: the table keeps one angle."""
 
     diagnosis: Diagnosis
@@ -43,16 +43,16 @@ class Resolvability:
         """What these poses would not show, and what would; what no poses show."""
         lines = []
         if self.unresolved:
-            cure = (
+            remedy = (
                 "another table angle, a quarter turn away, would tell"
                 if self.still
                 else ("other table angles, more images or longer travel would tell")
             )
             names = ", ".join(f"{h.name} (delta chi2 {h.delta:.2g} of {BETTER:g})" for h in self.unresolved)
-            lines.append(f"these poses would not show: {names}; {cure}")
+            lines.append(f"these poses would not show: {names}; {remedy}")
         else:
             lines.append(
-                f"all of {sum(not h.symmetry for h in self.diagnosis.hypotheses) - 1} rival conventions would "
+                f"all of {sum(not h.symmetry for h in self.diagnosis.hypotheses) - 1} alternative conventions would "
                 f"show by 5 sigma or more"
             )
         if self.symmetric:
@@ -75,9 +75,9 @@ def resolvability(
     problem = exact_problem(scanner, poses, T_HT=T_HT, t=t, sigma=sigma)
     held = free_parameters(problem.scanners, fix=tuple(UNITS))
     diagnosis = ranked(problem, held, best_fit(problem, held))
-    rivals = [h for h in diagnosis.hypotheses if h.outcome != "declared"]
-    close = [h for h in rivals if h.delta < BETTER]
-    plain = [h for h in rivals if not h.symmetry]
+    alternatives = [h for h in diagnosis.hypotheses if h.outcome != "declared"]
+    close = [h for h in alternatives if h.delta < BETTER]
+    plain = [h for h in alternatives if not h.symmetry]
     unresolved = tuple(h for h in close if not h.symmetry)
     return Resolvability(
         diagnosis=diagnosis,
@@ -89,9 +89,10 @@ def resolvability(
 
 
 def telling(everything: Problem, index: Any, unresolved: Iterable[Hypothesis], n: int) -> list[int]:
-    """Candidates at which rivals that fit the rows `index` of `everything` are farthest from the truth, n for each.
+    """Candidates at which alternatives that fit the rows `index` of `everything` are farthest from the truth, n for
+    each.
 
-    Rivals that no candidate would show by half of what is wanted, even in n images, are passed over.
+    Alternatives that no candidate would show by half of what is wanted, even in n images, are passed over.
     """
     held = free_parameters(everything.scanners, fix=tuple(UNITS))
     part = everything.select(index)
@@ -105,5 +106,5 @@ def telling(everything: Problem, index: Any, unresolved: Iterable[Hypothesis], n
         best = np.argsort(-d2, kind="stable")[:n]
         if d2[best].sum() > BETTER / 2:
             found += [int(i) for i in best]
-    # rivals that are each other's opposite ask for the same poses
+    # alternatives that are each other's opposite ask for the same poses
     return list(dict.fromkeys(found))

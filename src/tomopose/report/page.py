@@ -1,6 +1,6 @@
 """A report as values: sections made of blocks, rendered to one HTML document that needs nothing from a network.
 
-The figures are plain dictionaries in the vocabulary of plotly.js; the script is embedded once, the data stand in the
+The figures are plain dictionaries in the vocabulary of plotly.js; the script is embedded once, the data are in the
 page as JSON, and a content security policy forbids the browser to load anything from elsewhere.
 """
 
@@ -101,7 +101,7 @@ class Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class KeyFigure:
-    """A number that stands at the top: its name, the number with its unit, and a word of explanation."""
+    """A number that is at the top: its name, the number with its unit, and a word of explanation."""
 
     name: str
     value: str

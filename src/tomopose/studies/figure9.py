@@ -31,7 +31,7 @@ WAVES: Mapping[float, Callable[[Array], Array]] = MappingProxyType({5.3: eq11_tr
 OBJECTS = MappingProxyType({5.3: "multi-feature specimen", 2.7: "multi-sphere standard"})
 
 TITLE = "Figure 9: source paths"
-QUESTION = "Where does the source stand, seen from the object, and how far is the driven tilt from the one meant?"
+QUESTION = "Where is the source, seen from the object, and how far is the driven tilt from the one meant?"
 NOTES = (
     "The path is taken from the projection matrices of eq. (5), not drawn from the formula: it passes the whole chain.",
     "The paper sets the poses with R_HT = R_z(pi), since no calibration was at hand; ours uses the calibrated R_HT. "

@@ -61,7 +61,7 @@ NOTES = (
     "identified from the same radiographs.",
     "Table angles, paper's method: standard uncertainty of t_HT along the beam with all poses at 0; ours: half of them "
     "at 90 degrees. Here the manipulator is perfect.",
-    "The C-arm carries source and detector about a ball that stands still: eq. (6) over the inverse chain. Its sag "
+    "The C-arm carries source and detector about a ball that does not move: eq. (6) over the inverse chain. Its sag "
     "goes with the sine and cosine of the joint angle.",
 )
 
@@ -70,7 +70,7 @@ NOTES = (
 class Experiment:
     """A machine with errors p, what is believed of it, its poses and scan, mount and balls (k, 3) in M; centre: middle
     of the object in M, mm; distances: between balls, known with a standard uncertainty, mm.  Where source and detector
-    move, poses are inverse ones and M names what stands still."""
+    move, poses are inverse ones and M names what does not move."""
 
     machine: Any
     believed: Any
@@ -160,7 +160,7 @@ def c_arm() -> SerialRobot:
 
 def c_arm_experiment(rng: np.random.Generator, *, n: int = 100) -> Experiment:
     """n views anywhere within +-20 mm of lift, +-45 deg of angulation and +-105 deg on the orbit, two balls of known
-    distance that stand still; a tilted orbit of 200 deg."""
+    distance that do not move; a tilted orbit of 200 deg."""
     arm = c_arm()
 
     def poses_at(lift: Array, angulation: Array, orbit: Array, **columns: Any) -> PoseSequence:

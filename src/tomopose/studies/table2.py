@@ -47,8 +47,8 @@ NOTES = (
     "moved. Our two runs differ by scatter and noise alone, so the differences are smaller. They come with their "
     "uncertainties: a difference within two of them says nothing.",
     "By our best the single coordinates of the mount are less certain than by the paper's method, and differ more from "
-    "run to run: mount and machine errors share directions that no ball can tell apart. They cancel in the scan, whose "
-    "error is the row that counts; the stated uncertainties hold the differences.",
+    "run to run: mount and machine errors share directions that no ball can distinguish. They cancel in the scan, "
+    "whose error is the row that counts; the stated uncertainties hold the differences.",
     "The uncertainties stated by the paper's method take its residuals for noise. They are the same errors in both "
     "runs, so the differences are far smaller than stated.",
     "The floor is the plate's scatter and our detection's error together: no calibration can go below it but by "

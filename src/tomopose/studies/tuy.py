@@ -39,7 +39,7 @@ NOTES = (
     "The stack of discs has exact line integrals and matrices, no noise, and is reconstructed by filtered "
     "back-projection along the source's path, on both paths: what differs is the path alone.",
     "A plane that is missed leaves the faces that lie in it blurred: on the circular path these are faces nearly "
-    "parallel to the source's plane, the more the higher they stand.",
+    "parallel to the source's plane, the more the higher they are.",
 )
 
 

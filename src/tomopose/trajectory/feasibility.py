@@ -92,7 +92,7 @@ def cylinder(radius: float, z_low: float, z_high: float, *, corners: int = 64) -
     The polygon is circumscribed, so a view that shows all points shows the cylinder.
     """
     if not (radius > 0 and z_high > z_low):
-        raise InputError(f"a cylinder of radius {radius:g} mm from z = {z_low:g} to {z_high:g} mm is none")
+        raise InputError(f"a cylinder of radius {radius:g} mm from z = {z_low:g} to {z_high:g} mm is not a cylinder")
     phi = 2 * np.pi * np.arange(corners) / corners
     rim = radius / np.cos(np.pi / corners) * np.column_stack([np.cos(phi), np.sin(phi)])
     return np.vstack([np.column_stack([rim, np.full(corners, z)]) for z in (z_low, z_high)])

@@ -1,4 +1,4 @@
-"""Pose sequences of scans: what manipulator and table are told while the radiographs are taken."""
+"""Pose sequences of scans: what manipulator and table are commanded while the radiographs are taken."""
 
 from __future__ import annotations
 

@@ -192,7 +192,7 @@ def _open(paths: list[Path], kind: str, raw_layout: RawLayout | None, dataset: s
         names = [Path(os.path.relpath(p.absolute(), common)).as_posix() for p in paths]
     if len(set(names)) < len(names):
         twice = next(p for k, p in enumerate(paths) if p in paths[:k])
-        raise InputError(f"{twice} stands more than once in the list of images")
+        raise InputError(f"{twice} appears more than once in the list of images")
     if kind == "TIFF":
         return open_tiff(paths, names)
     if kind == "DICOM":

@@ -150,8 +150,8 @@ def table_angles(joined: Joined) -> Figure | None:
     return Figure(
         title="Coverage of table angles",
         meaning="How many poses were imaged at each angle of the rotary table.",
-        look_for="With one angle only, d_SR, u_0 and detector roll cannot be told from the mount; two angles 90° apart "
-        "cure it.",
+        look_for="With one angle only, d_SR, u_0 and detector roll cannot be distinguished from the mount; two angles "
+        "90° apart distinguish them.",
         data=[
             {
                 "type": "barpolar",

@@ -35,7 +35,7 @@ def vik_scale(steps: int = 33) -> list[list[Any]]:
 
 
 def viewpoint(azimuth_deg: float, elevation_deg: float) -> Array:
-    """(3, 3), rows right, up and towards a viewer who stands at that azimuth and elevation; z points up."""
+    """(3, 3), rows right, up and towards a viewer who is at that azimuth and elevation; z points up."""
     a, e = np.radians([azimuth_deg, elevation_deg])
     towards = np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
     right = np.array([-np.sin(a), np.cos(a), 0.0])

@@ -134,7 +134,7 @@ def scanner_scene(calibration: Calibration, joined: Joined) -> Figure:
     return Figure(
         title="The scanner, to scale",
         meaning="Source, beam, detector, table axis and the manipulator's frame H in the world frame W, as calibrated.",
-        look_for="The manipulator's axes should stand as it is mounted, and the ball should lie in the beam.",
+        look_for="The manipulator's axes should point as it is mounted, and the ball should lie in the beam.",
         data=data,
         layout=_scene(camera=NEAR_CAMERA, yaxis=space_axis("y / mm", nticks=3), zaxis=space_axis("z / mm", nticks=4)),
         height=430,

@@ -82,7 +82,7 @@ def rotation_to(axis: ArrayLike) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Primitive(Shape):
-    """One primitive: kind, its lengths `p` (mm), half the sides of its box, and where it stands: x = R x_local + t."""
+    """One primitive: kind, its lengths `p` (mm), half the sides of its box, and its place: x = R x_local + t."""
 
     kind: int
     p: tuple[float, ...]

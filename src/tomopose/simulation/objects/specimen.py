@@ -72,7 +72,7 @@ def _nominal(edge: float, segments: int) -> TriangleMesh:
     core = rod(CORE_RADIUS, -z, z)
     for k in range(6):
         angle = k * 60.0
-        # Flats along the core's middle, on which the cuboids stand.
+        # Flats along the core's middle, on which the cuboids rest.
         flat = M.cube([CORE_RADIUS, 2 * CORE_RADIUS, LENGTH - 2 * FLANGE_LENGTH], True)
         core -= flat.translate([FLAT + CORE_RADIUS / 2, 0.0, 0.0]).rotate([0.0, 0.0, angle])
     body = core + rod(FLANGE_RADIUS, -z, -z + FLANGE_LENGTH) + rod(FLANGE_RADIUS, z - FLANGE_LENGTH, z)

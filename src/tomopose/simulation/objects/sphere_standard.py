@@ -1,6 +1,6 @@
 """The multi-sphere standard (paper sec. 6.1): 27 ruby spheres of 5 mm on ceramic shafts over an Invar base.
 
-The paper names the parts but not where they stand, so the layout is this project's own: a sunflower spiral seen from
+The paper names the parts but not their positions, so the layout is this project's own: a sunflower spiral seen from
 above, heights that jump from neighbour to neighbour, all 351 distances different.  data/standard.csv holds the
 coordinates, as a calibration certificate would.
 """

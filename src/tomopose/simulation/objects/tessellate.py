@@ -24,7 +24,7 @@ from tomopose.simulation.objects.shapes import (
 )
 
 HUGE = 1.0e4
-"""Side of the box that stands for a half-space, mm."""
+"""Side of the box that denotes a half-space, mm."""
 
 
 def manifold() -> Any:

@@ -138,7 +138,7 @@ def condense(
     longest: ArrayLike,
     materials_table: Mapping[str, Material] = MATERIALS,
 ) -> Beam:
-    """A dozen energies that stand for the whole spectrum.
+    """A dozen energies that represent the whole spectrum.
 
     materials: the m names of path columns; longest: (m,) longest path in each, mm.  The weights are the non-negative
     least-squares solution over paths that fill the box up to `longest`; its answers are sparse by nature.

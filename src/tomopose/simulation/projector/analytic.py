@@ -137,7 +137,7 @@ def _cells(
                 middle, here = at(c, work, left + 0.5, low + 0.5)
                 off = middle - (f_00 + f_01 + f_10 + f_11) / 4
                 if here == mark and abs(off) < FLAT / 2:
-                    # A neighbour meets the edge.  The middle tells the sum of the curvatures alone.
+                    # A neighbour meets the edge.  The middle gives the sum of the curvatures alone.
                     fill_pixel(out, j, i, f, weight, bow, f_00, f_01, f_10, f_11, -4 * off, -4 * off)
                     continue
             for a in range(f + 1):

@@ -1,7 +1,7 @@
 """gVirtualXray as a second engine: it casts the rays, all else is this package's own.
 
 Its L-buffers (path lengths through each mesh, on a graphics card or on Mesa's software renderer) take the place of the
-projector's rays.  How it starts without a screen is told in docs/concepts/virtual-ct.md.
+projector's rays.  How it starts without a screen is described in docs/concepts/virtual-ct.md.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def _engine() -> Any:
             'engine = "gvxr" needs gvxr, which is not installed', install_line='pip install "tomopose[gvxr]"'
         ) from error
     try:
-        # It tells its start-up story to the terminal unless it is given another place.
+        # It writes its start-up messages to the terminal unless it is given another place.
         gvxr.useLogFile(os.devnull)
         gvxr.createWindow(-1, 0, "EGL")
         gvxr.usePointSource()

@@ -50,7 +50,7 @@ def work_space(c: Arrays, depth: int) -> Any:
 
 @njit(cache=True, nogil=True)
 def lengths(c: Arrays, work: Arrays, u: float, v: float) -> Any:
-    """The signature of the ray through pixel coordinates (u, v); its path lengths stand in work[2]."""
+    """The signature of the ray through pixel coordinates (u, v); its path lengths are in work[2]."""
     kind, p, R, t, ops, first, material, centre, radius, _, s, O, U, V, boxes = c
     T, S, L, active = work
     nothing = True
@@ -98,7 +98,7 @@ def coarse_corners(
 
 @njit(cache=True, nogil=True)
 def _even(I: np.ndarray, seen: np.ndarray, j: int, i: int) -> bool:
-    """Whether cubic interpolation between coarse corners (j, i) and (j + 1, i + 1) stands for the rays there."""
+    """Whether cubic interpolation between coarse corners (j, i) and (j + 1, i + 1) denotes the rays there."""
     if j < 1 or i < 1 or j + 2 >= I.shape[0] or i + 2 >= I.shape[1] or seen[j, i] == 0:
         return False
     for a in range(j - 1, j + 3):

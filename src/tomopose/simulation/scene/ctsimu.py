@@ -31,7 +31,7 @@ from tomopose.simulation.projector.focal_spot import FWHM_PER_SIGMA, FocalSpot
 from tomopose.simulation.run import SimulatedRun
 
 STEADY_MM, STEADY_PX = 1e-6, 1e-6
-"""How far the intrinsic geometry may change from frame to frame; the virtual scanner's stands still."""
+"""How far the intrinsic geometry may change from frame to frame; the virtual scanner's does not move."""
 STAGE_TO_M = np.diag([-1.0, -1.0, 1.0])
 """The stage's axes are W's turned by 180 degrees about w."""
 SIGMA_PER_RESOLUTION = 2 * math.sqrt(math.log(5) / 2) / math.pi
@@ -153,7 +153,7 @@ def _material(entry: Mapping[str, Any]) -> Material:
 def _vector(entry: Any, names: str, where: str) -> Any:
     values = [_number(entry, name) for name in names]
     if any(v is None for v in values):
-        raise InputError(f"CTSimU: {where} is not given along {', '.join(names)}; samples must stand on the stage")
+        raise InputError(f"CTSimU: {where} is not given along {', '.join(names)}; samples must be on the stage")
     return np.array(values, dtype=np.float64)
 
 

@@ -1,4 +1,4 @@
-"""The scene file: TOML in, checked model out.  Its keys carry units; docs/formats/scene.md tells them one by one."""
+"""The scene file: TOML in, checked model out.  Its keys carry units; docs/formats/scene.md lists them."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ class MaterialPart(Part):
 
 
 class Placed(Part):
-    """Where an object stands in its frame: x -> R x + t, R = R_x R_y R_z."""
+    """Where an object is in its frame: x -> R x + t, R = R_x R_y R_z."""
 
     name: str = ""
     frame: Literal["M", "H", "T", "W"] = "M"

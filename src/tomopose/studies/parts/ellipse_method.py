@@ -1,6 +1,6 @@
 r"""The paper's way to find the ball: an ellipse fitted to edge pixels, its centre corrected (paper sec. 5, ref. [19]).
 
-The paper's code for it is not published; this stands in for it: whole edge pixels as of Canny's detector (Gaussian
+The paper's code for it is not published; this is in for it: whole edge pixels as of Canny's detector (Gaussian
 smoothing, non-maximum suppression of the gradient), the direct least-squares ellipse, and the exact correction of the
 centre.  Pixels are whole, so each edge point is off by up to half a pixel: some 0.3 / sqrt(n / 2) px in each coordinate
 of the centre, whatever the noise.

@@ -46,7 +46,7 @@ SCAN_VIEWS = 180
 
 
 def real_T_MH(poses: PoseSequence, magnification: float, rng: np.random.Generator | None = None) -> RigidTransform:
-    """Where the plate really stands in each pose; with rng, it scatters as well."""
+    """Where the plate really is in each pose; with rng, it scatters as well."""
     R, t = poses.T_MH.R, poses.T_MH.t
     C = exp_rotation(np.array(TURNED_AXES))
     R_real = C @ R @ C.T

@@ -46,7 +46,7 @@ def rigid(run: BallRun, observations: BallObservations) -> Calibration:
 
 
 def kinematic(run: BallRun, observations: BallObservations, magnification: float) -> Calibration:
-    """With the manipulator's errors identified; it is not told their form."""
+    """With the manipulator's errors identified; it does not know their form."""
     return calibrate(
         run.scanner,
         run.poses,

@@ -21,7 +21,7 @@ def fine_matrices(P: Array, samples: int) -> Array:
 
 
 def mesh_paths(P: Array, solid: MeshSolid, n_u: int, n_v: int) -> Array:
-    """Path lengths (n_v, n_u), mm, in the view with P (3, 4) through a closed mesh that stands still in W."""
+    """Path lengths (n_v, n_u), mm, in the view with P (3, 4) through a closed mesh that does not move in W."""
     window = Window(u_0=0, v_0=0, n_u=n_u, n_v=n_v)
     return mesh_path_image((solid,), View.of_matrix(P), {solid.frame: RigidTransform.identity(Frame.W)}, window)
 

@@ -1,4 +1,4 @@
-"""The measurement scans of sec. 6: which object stands where, which views are taken, and what the detector counts."""
+"""The measurement scans of sec. 6: which object is where, which views are taken, and what the detector counts."""
 
 from __future__ import annotations
 

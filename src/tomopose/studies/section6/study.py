@@ -61,7 +61,7 @@ NOTES = (
     "angles, kinematic calibration, filtered back-projection with the ramp along the source's path; of its voxels only "
     "those near the object are found, which changes none of them. Both reconstruct the same radiographs, and are "
     "measured alike. What the kinematic calibration makes of the paper's own poses is in study table2.",
-    "The paper prints few numbers here: most of its results are bars and colours. Only what stands in its text is "
+    "The paper prints few numbers here: most of its results are bars and colours. Only what is in its text is "
     "repeated in the column of printed values.",
     "The specimen and the standard have the paper's kinds of feature and size; all their other measures are this "
     "project's own. The specimen is mounted tilted by 42 degrees, the standard upright; neither angle is printed.",
@@ -76,7 +76,7 @@ NOTES = (
     "At the small scale centres are projected and given the paper's detection error of table 1 for both methods, and "
     "volumes are coarse (0.38 and 0.59 mm): what is left in the circular scan is mostly the voxels and the few views, "
     "and the sphericities say more about these than about matrices. At the paper's scale the centres come from "
-    "simulated radiographs, and volumes that others stand for are left out: the second calibration, the circular scan "
+    "simulated radiographs, and volumes that others represent are left out: the second calibration, the circular scan "
     "by SART, the true matrices and the orders of the views.",
     "A circle sees a surface where some source position lies in its tangent plane (Tuy's condition). At the small "
     "scale the thread, where the specimen breaks it, is not resolved; the rows over such places appear where it is.",
