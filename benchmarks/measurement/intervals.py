@@ -45,7 +45,7 @@ def one(rng, sd, correlation):
     edge = [ndtr((s + h) / V) - ndtr((s - h) / V) for s, h in ((z, length / 2), (y, 1.0), (x, 0.8))]
     values += edge[0][:, None, None] * edge[1][None, :, None] * edge[2][None, None, :]
     volume = as_volume(values + noise_of(rng, grid.shape, sd, correlation), grid)
-    side = {"kind": "plane", "u": [0.8, 0, 0], "v": [0, 1.0, 0], "safety_mm": 0.3, "n_points": 250}
+    side = {"kind": "plane", "u": [0.8, 0, 0], "v": [0, 1.0, 0], "safety_mm": 0.3, "n_points": 250, "outliers": 3.0}
     plan = plan_from(
         {
             "schema": "tomopose/measurement-plan/1",
@@ -53,7 +53,13 @@ def one(rng, sd, correlation):
             "surface": {"background": 0.0, "material": 1.0},
             "features": {
                 **{
-                    f"ball {k}": {"kind": "sphere", "point": b.tolist(), "radius_mm": 0.95, "n_points": 600}
+                    f"ball {k}": {
+                        "kind": "sphere",
+                        "point": b.tolist(),
+                        "radius_mm": 0.95,
+                        "n_points": 600,
+                        "outliers": 3.0,
+                    }
                     for k, b in enumerate(balls)
                 },
                 "top": {**side, "point": (shift[2] + [0, 0, length / 2]).tolist(), "direction": [0, 0, 1]},

@@ -101,7 +101,13 @@ class VirtualPart:
 
 def plan_of(balls, block, sides):
     features = {
-        f"ball {k}": {"kind": "sphere", "point": b.tolist(), "radius_mm": RADIUS, "n_points": 800}
+        f"ball {k}": {
+            "kind": "sphere",
+            "point": b.tolist(),
+            "radius_mm": RADIUS,
+            "n_points": 800,
+            "outliers": 3.0,
+        }
         for k, b in enumerate(balls)
     }
     measurands = [
@@ -124,6 +130,7 @@ def plan_of(balls, block, sides):
                 "v": v.tolist(),
                 "safety_mm": 0.45,
                 "n_points": 500,
+                "outliers": 3.0,
             }
         measurands.append(
             {"name": f"L{name}", "kind": "distance", "of": ["+" + name, "-" + name], "nominal_mm": float(sides[a])}

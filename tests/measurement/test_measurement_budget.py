@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.stats import t
 
+from tomopose.coverage import combined, coverage_factor, expanded, expanded_k2
 from tomopose.measurement.budget import budget
-from tomopose.measurement.results import MeasurementResult, Repeat
+from tomopose.measurement.result import Decision, MeasurementResult, Repeat, decide
+from tomopose.measurement.results import MeasurementResults
 from tomopose.measurement.uncertainty import Simulated
 
 
@@ -97,3 +100,103 @@ def test_form_is_not_corrected_and_has_an_uncertainty_from_simulation_alone():
     found = budget(result(u=math.nan, kind="form_95"), simulated=drawn(0.06, 0.003))
     assert found.u == pytest.approx(0.003 * math.sqrt(1 + 1 / 20))
     assert found.corrected == 10.0
+
+
+def repeats_of(values, **more):
+    """The repeats of one length over volumes with these values, whose fits state nothing."""
+    rows = tuple(
+        MeasurementResult(
+            name="L",
+            kind="distance",
+            value=float(v),
+            u=math.nan,
+            unit="mm",
+            method="",
+            direction="",
+            volume=f"scan {k}",
+            **more,
+        )
+        for k, v in enumerate(values)
+    )
+    volumes = tuple(r.volume for r in rows)
+    return MeasurementResults(
+        plan_name="", results=rows, features={v: {} for v in volumes}, groups={"group": volumes}
+    ).repeats()[0]
+
+
+RUNS = 3000
+SLACK = 3 * math.sqrt(0.95 * 0.05 / RUNS)
+
+
+@pytest.mark.parametrize("n", [2, 3, 5, 20])
+def test_the_intervals_of_repeats_hold_95_percent_whatever_their_number(n):
+    """Without a calibrated reference: one further scan, and the mean."""
+    rng = np.random.default_rng(n)
+    further, mean = [], []
+    for scans in 12.0 + 0.002 * rng.standard_normal((RUNS, n + 1)):
+        found = repeats_of(scans[1:])
+        further.append(abs(scans[0] - 12.0) <= found.U)
+        mean.append(abs(found.mean - 12.0) <= found.U_mean)
+    assert np.mean(further) == pytest.approx(0.95, abs=SLACK)
+    assert np.mean(mean) == pytest.approx(0.95, abs=SLACK)
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.002, 0.02])
+@pytest.mark.parametrize("n", [2, 3, 5, 20])
+def test_the_interval_with_a_calibrated_reference_holds_at_least_95_percent(n, bias):
+    """The mean error is added, not taken off: one side is then never missed, and 97.5 % are held at most."""
+    rng = np.random.default_rng([n, round(1e4 * bias)])
+    held = []
+    for scans in 12.0 + bias + 0.002 * rng.standard_normal((RUNS, n + 1)):
+        held.append(abs(scans[0] - 12.0) <= repeats_of(scans[1:], reference=12.0).U)
+    assert 0.95 - SLACK < np.mean(held) < 0.975 + SLACK
+
+
+def test_one_rule_of_coverage():
+    assert expanded(0.002, 4) == pytest.approx(t.ppf(0.975, 4) * 0.002)
+    assert coverage_factor() == pytest.approx(1.959964, abs=1e-6)
+    assert math.isnan(expanded(0.002, 0))
+    assert math.isnan(expanded(math.inf))
+    assert expanded_k2(0.003) == 0.006
+    assert combined([(3.0, 10.0), (4.0, math.inf), (0.0, 1.0)]) == (5.0, pytest.approx(5**4 / (81 / 10)))
+    assert combined([]) == (0.0, math.inf)
+
+
+class TestDecision:
+    """ISO 14253-1: the whole interval within the limit, the whole interval beyond it, or neither."""
+
+    @pytest.mark.parametrize(
+        ("error", "U", "expected"),
+        [
+            (3.0, 1.0, Decision.CONFORMING),
+            (-4.0, 1.0, Decision.CONFORMING),
+            (4.5, 1.0, Decision.NOT_DECIDABLE),
+            (5.5, 1.0, Decision.NOT_DECIDABLE),
+            (-6.5, 1.0, Decision.NOT_CONFORMING),
+            (0.0, math.nan, Decision.NOT_DECIDABLE),
+            (math.nan, 1.0, Decision.NOT_DECIDABLE),
+            (99.0, math.inf, Decision.NOT_DECIDABLE),
+        ],
+    )
+    def test_each_case(self, error, U, expected):
+        assert decide(error, U, 5.0) is expected
+
+    def test_repeats_that_scatter_more_than_the_fit_states_undo_a_conformity(self):
+        row = result(u=0.0005)
+        row = replace(row, reference=10.0, limit=0.004, limit_rule="tolerance")
+        assert row.decision is Decision.CONFORMING
+        assert budget(row).decision is Decision.CONFORMING
+        assert budget(row, repeat=repeat(0.003)).decision is Decision.NOT_DECIDABLE
+
+    def test_a_simulation_corrects_a_workpiece_and_not_an_instrument(self):
+        row = replace(result(u=0.0005), value=10.006, reference=10.0, limit=0.004)
+        off = drawn(0.006, 0.0005, u_fit=0.0005, dof_fit=800.0)
+        assert budget(replace(row, limit_rule="tolerance"), simulated=off).decision is Decision.CONFORMING
+        assert budget(replace(row, limit_rule="MPE"), simulated=off).decision is Decision.NOT_CONFORMING
+
+    def test_the_reference_widens_the_error_and_not_the_value(self):
+        row = replace(result(u=0.0005), reference=10.0, u_reference=0.002, limit=0.004)
+        found = budget(row)
+        assert found.u == 0.0005
+        assert found.U_error == pytest.approx(expanded(*combined([(0.0005, 40.0), (0.002, math.inf)])))
+        assert found.decision is Decision.NOT_DECIDABLE

@@ -63,20 +63,8 @@ def measured(folder):
         for name, k in (("one", 1), ("two", 2), ("circular", 3))
         for w in ("--volume", f"{name}={folder / f'scan{k}.h5'}")
     ]
-    assert (
-        run(
-            folder / "repeats.toml",
-            *volumes,
-            "--reference",
-            folder / "part.stl",
-            "--fit",
-            "datum",
-            "--out",
-            out,
-            "--quiet",
-        )
-        == 0
-    )
+    words = ["--reference", folder / "part.stl", "--fit", "datum", "--out", out, "--quiet"]
+    assert run(folder / "repeats.toml", *volumes, *words) == 0
     return out
 
 
@@ -89,6 +77,31 @@ def test_the_summary(folder, capsys):
     assert said["alignments"]["scan1"]["rule"] == "datum, 3-2-1"
     with pytest.raises(FileError, match="exists"):
         run(folder / "plan.toml", "--volume", folder / "scan1.h5", "--out", out)
+
+
+def test_a_limit_that_is_exceeded_by_more_than_the_uncertainty_is_exit_code_3(folder, capsys):
+    """L1 is 3.84 mm; where 3.9 is wanted no noise makes up for it."""
+    (folder / "beyond.toml").write_text(PLAN.replace("calibrated_mm = 3.84", "calibrated_mm = 3.9"), encoding="utf-8")
+    out = folder / "beyond"
+    assert run(folder / "beyond.toml", "--volume", folder / "scan1.h5", "--out", out, "--json") == 3
+    said = json.loads(capsys.readouterr().out)
+    assert said["beyond_limits"] == ["L1"]
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "Not conforming" in page
+    rows = {r["name"]: r for r in rows_of(out / "measurement.csv")}
+    assert rows["L1"]["decision"] == "not conforming"
+
+
+def test_what_cannot_be_decided_is_not_said_to_conform(folder, capsys):
+    """An MPE between the error and the error plus its uncertainty: exit code 0, and nobody says "within limits"."""
+    narrow = PLAN.replace("A_um = 9.0, K = 50.0", "A_um = 0.9")
+    (folder / "narrow.toml").write_text(narrow, encoding="utf-8")
+    out = folder / "narrow"
+    assert run(folder / "narrow.toml", "--volume", folder / "scan1.h5", "--out", out) == 0
+    assert "not decidable: scan1 L1" in capsys.readouterr().out
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "Not decidable" in page
+    assert "ithin limits" not in page
 
 
 def test_the_report_shows_groups_side_by_side_and_the_comparison(measured):

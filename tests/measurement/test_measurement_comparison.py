@@ -198,7 +198,7 @@ def write_stl(path, mesh):
 
 def test_files_round_trip(block, mesh, tmp_path):
     found = compare(block, mesh)
-    write_comparison(found, tmp_path, range_mm=0.025)
+    write_comparison(tmp_path, found, range_mm=0.025)
     assert all((tmp_path / f).stat().st_size > 100 for f in FILES)
     again = read_mesh(tmp_path / "comparison.ply")
     assert again.points == pytest.approx(found.points)
@@ -209,7 +209,7 @@ def test_files_round_trip(block, mesh, tmp_path):
     summary = json.loads((tmp_path / "comparison.json").read_text(encoding="utf-8"))
     assert summary["on_edge"] == mesh.on_edge.sum()
     with pytest.raises(FileError, match="exists"):
-        write_comparison(found, tmp_path, range_mm=0.025)
+        write_comparison(tmp_path, found, range_mm=0.025)
     write_stl(tmp_path / "box.stl", mesh)
     stl = read_mesh(tmp_path / "box.stl")
     assert stl.open_edges == 0
@@ -221,7 +221,7 @@ def test_vtk_reads_the_vtp(block, mesh, tmp_path):
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
     found = compare(block, mesh)
-    write_comparison(found, tmp_path, range_mm=0.025)
+    write_comparison(tmp_path, found, range_mm=0.025)
     reader = vtkXMLPolyDataReader()
     reader.SetFileName(str(tmp_path / "comparison.vtp"))
     reader.Update()

@@ -201,8 +201,31 @@ def test_form_deviations():
     points, normals = sphere_pattern([0, 0, 0], 2.5, 3000)
     found = fit_sphere(points + 0.01 * normals * np.sign(points[:, 2:3] * points[:, :1]))
     assert found.form == pytest.approx(0.02, rel=0.02)
-    assert len(patch_means(found, 25)) == 25
+    assert len(patch_means(found.points, found.residuals, 25)) == 25
     assert found.form_25 <= found.form + 1e-12
+
+
+DENTED = {
+    "plane": (lambda n: plane_pattern([0, 0, 0], [0, 0, 1], [4, 0, 0], [0, 3, 0], n), fit_plane),
+    "sphere": (lambda n: sphere_pattern([0, 0, 0], 5.0, n), fit_sphere),
+    "cylinder": (lambda n: cylinder_pattern([0, 0, 0], [0, 0, 1], 4.0, 8.0, n), fit_cylinder),
+}
+
+
+@pytest.mark.parametrize("outliers", [None, 3.0])
+@pytest.mark.parametrize("n", [400, 4000])
+@pytest.mark.parametrize("kind", DENTED)
+def test_a_dent_on_2_percent_of_the_points_is_the_form(kind, n, outliers):
+    pattern, fit = DENTED[kind]
+    points, normals = pattern(n)
+    dent = np.argsort(np.linalg.norm(points - points[n // 3], axis=1))[: round(0.02 * len(points))]
+    points[dent] -= 0.05 * normals[dent]
+    points += 0.0002 * np.random.default_rng(n).standard_normal((len(points), 1)) * normals
+    found = fit(points, outliers=outliers)
+    assert found.form == pytest.approx(0.05, rel=0.05)
+    assert found.n_set_aside == (0 if outliers is None else len(points) - found.n_used)
+    assert (found.n_set_aside >= len(dent)) == (outliers is not None)
+    assert f"range of {len(points)} points" in m.form(found, "form").method
 
 
 class TestMeasurands:

@@ -15,6 +15,7 @@ from tomopose.geometry.rotations import exp_rotation, log_rotation
 from tomopose.measurement.alignment import datum, from_datums
 from tomopose.measurement.measure import measure
 from tomopose.measurement.plan import plan_from, plan_schema, read_plan
+from tomopose.measurement.result import Decision
 from tomopose.measurement.results import write_results
 from tomopose.volume import VoxelGrid
 
@@ -119,7 +120,9 @@ def test_a_clean_block(plan):
     assert length.limit == pytest.approx((9 + 3.84 / 50) / 1000)
     assert length.within
     assert by_name["square"].value == pytest.approx(np.pi / 2, abs=1e-6)
-    assert by_name["flatness"].within
+    assert by_name["flatness"].value < by_name["flatness"].limit
+    # One surface does not say how uncertain its form is, so no conformity is proved.
+    assert by_name["flatness"].decision is Decision.NOT_DECIDABLE
     assert by_name["height"].value == pytest.approx(CENTRE[2] + HALF[2], abs=2e-6)
 
 
@@ -135,15 +138,129 @@ def test_groups_of_repeats_side_by_side_and_their_files(document, tmp_path):
     assert repeat.n == 3
     assert repeat.mean == pytest.approx(np.mean(values))
     assert repeat.s == pytest.approx(np.std(values, ddof=1))
+    u = np.hypot(max(repeat.s, np.mean([r.u for r in found.results if r.name == "L1"][:3])), 0.0003)
     assert 2 * repeat.s <= repeat.U
-    write_results(found, tmp_path / "out")
+    assert 1.95 * u + abs(repeat.mean - 3.84) < repeat.U
+    assert repeat.U_mean < repeat.U
+    write_results(tmp_path / "out", found)
     document = json.loads((tmp_path / "out" / "measurement.json").read_text(encoding="utf-8"))
     assert document["schema"] == "tomopose/measurement/1"
     assert len(document["results"]) == 16
     lines = (tmp_path / "out" / "measurement.csv").read_text(encoding="utf-8").splitlines()
     assert len(lines) == 17
     with pytest.raises(FileError, match="exists"):
-        write_results(found, tmp_path / "out")
+        write_results(tmp_path / "out", found)
+
+
+def dented(depth, side=0.25, rim=0.12):
+    """The block with a dent, mm, on its top: a square of 2 side in its middle, smooth at its rim."""
+    whole = block()
+    grid = whole.grid
+    z, y, x = (grid.origin[2 - a] + V * np.arange(grid.shape[a]) for a in range(3))
+    lateral = [ndtr((s - c + side) / rim) - ndtr((s - c - side) / rim) for s, c in ((y, CENTRE[1]), (x, CENTRE[0]))]
+    top = CENTRE[2] + HALF[2] - depth / (2 * ndtr(side / rim) - 1) ** 2 * lateral[0][:, None] * lateral[1][None, :]
+    bare = ndtr((CENTRE[2] + HALF[2] - z) / SIGMA)[:, None, None]
+    return as_volume(whole.values * ndtr((top[None] - z[:, None, None]) / SIGMA) / np.maximum(bare, 1e-300), grid)
+
+
+def test_the_form_of_a_dent_is_its_depth(document):
+    """50 um on some percent of a face: an outlier rule would set the dent aside and state the noise."""
+    document["measurands"] = [
+        {"name": "flatness", "kind": "form", "of": ["top"]},
+        {"name": "zone", "kind": "form", "of": ["top"], "reference": "minimum-zone"},
+        {"name": "kept", "kind": "form", "of": ["robust"], "points": "kept"},
+        {"name": "all of robust", "kind": "form", "of": ["robust"]},
+    ]
+    document["features"]["robust"] = document["features"]["top"] | {"outliers": 3.0}
+    found = {r.name: r for r in measure(dented(0.05), plan_from(document)).results}
+    for name in ("flatness", "zone", "all of robust"):
+        assert found[name].value == pytest.approx(0.05, rel=0.05)
+    assert found["flatness"].n_set_aside == 0
+    assert "all points" in found["flatness"].method
+    assert "minimum-zone plane" in found["zone"].method
+    assert found["zone"].value <= found["flatness"].value + 1e-12
+    # The robust option is the plan's, and the result says how many points it set aside.
+    assert found["kept"].value < 0.5 * found["flatness"].value
+    assert found["kept"].n_set_aside > 10
+    assert f"{found['kept'].n_set_aside} points set aside" in found["kept"].method
+
+
+def test_a_form_beyond_its_tolerance_does_not_conform_unless_noise_makes_it(document):
+    document["measurands"] = [{"name": "flatness", "kind": "form", "of": ["top"], "tolerance_mm": 0.01}]
+    dent = measure(dented(0.05), plan_from(document)).results[0]
+    noisy = measure(block(0.1, 2), plan_from(document)).results[0]
+    assert min(dent.value, noisy.value) > 0.01
+    assert dent.decision is Decision.NOT_CONFORMING
+    assert noisy.decision is Decision.NOT_DECIDABLE
+
+
+def test_reference_features_of_a_plan_are_fitted_and_named(document):
+    document["features"]["top"]["reference"] = "minimum-zone"
+    found = measure(block(0.03, 1), plan_from(document))
+    top = found.features["volume"]["top"]
+    assert top.association == "minimum-zone"
+    assert len(top.contacts) == 4
+    length = {r.name: r for r in found.results}["L1"]
+    assert length.association == "least-squares and minimum-zone"
+    assert np.isnan(length.u)
+    assert found.to_json()["features"]["volume"]["top"]["association"] == "minimum-zone"
+
+
+def test_a_straightness_is_signed_along_the_probed_normal(document):
+    """A profile that bends to both sides: distances without a sign would state half of it."""
+    points = np.linspace(-1, 1, 100)
+    document["features"] = {
+        "track": {
+            "kind": "line",
+            "point": [0, 0, 1.92],
+            "direction": [1, 0, 0],
+            "normal": [0, 0, 1],
+            "length_mm": 2.0,
+            "safety_mm": 0.0,
+            "n_points": len(points),
+        }
+    }
+    document["alignment"] = {"kind": "none", "start": [[1, 0, 0, 0.32], [0, 1, 0, -0.21], [0, 0, 1, 0.14]]}
+    document["measurands"] = [
+        {"name": "s", "kind": "form", "of": ["track"]},
+        {"name": "zone", "kind": "form", "of": ["track"], "reference": "minimum-zone"},
+    ]
+    found = measure(block(0.03, 1), plan_from(document))
+    track = found.features["volume"]["track"]
+    value = {r.name: r.value for r in found.results}
+    assert track.residuals.min() < 0 < track.residuals.max()
+    assert value["s"] == pytest.approx(np.ptp(track.residuals))
+    assert 0.5 * value["s"] < value["zone"] <= value["s"] + 1e-12
+
+
+class TestStatedTerms:
+    def test_what_no_scan_shows_is_stated_and_added(self, document):
+        document["uncertainty"] = {"u_workpiece_mm": 0.0004, "u_drift_mm": 0.0002, "u_temperature_K": 0.5}
+        document["expansion_per_K"] = 23e-6
+        found = measure(block(0.03, 1), plan_from(document))
+        length, budget = found.results[0], found.budgets()[0]
+        assert length.stated == {
+            "workpiece": 0.0004,
+            "temperature": pytest.approx(3.84 * 23e-6 * 0.5, rel=1e-3),
+            "drift": 0.0002,
+        }
+        assert budget.u == pytest.approx(np.hypot(np.hypot(length.u, 0.0004), length.stated["temperature"]))
+        assert budget.interval == "fit, workpiece, temperature; without the systematic part"
+        # The reference's own uncertainty belongs to the error, not to the value.
+        assert budget.U_error > budget.U
+        assert "workpiece" in found.budgets_csv().splitlines()[0]
+
+    def test_an_unstated_uncertainty_of_the_reference_proves_no_conformity(self, document):
+        del document["measurands"][0]["u_calibrated_mm"]
+        found = measure(block(), plan_from(document))
+        assert found.results[0].decision is Decision.NOT_DECIDABLE
+        document["measurands"][0]["calibrated_mm"] = 3.9
+        assert measure(block(), plan_from(document)).out_of_limits[0].name == "L1"
+
+    def test_a_form_needs_no_nominal_value_to_be_judged(self, document):
+        del document["measurands"][2]["nominal_mm"]
+        found = measure(block(), plan_from(document))
+        assert {r.name: r for r in found.results}["flatness"].reference == 0.0
 
 
 def test_volumes_are_no_repeats_unless_the_plan_says_so(plan):
@@ -332,6 +449,25 @@ class TestBadPlans:
         }
         with pytest.raises(InputError, match="runs along it"):
             measure(block(), plan_from(document))
+
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [
+            ({"kind": "angle", "of": ["top", "side"], "tolerance_mm": 0.1, "nominal_deg": 90}, "takes no tolerance_mm"),
+            ({"kind": "z", "of": ["top"], "tolerance_mm": 0.1}, "no value that it belongs to"),
+            ({"kind": "z", "of": ["top"], "points": "kept"}, "belong to form"),
+            ({"kind": "form", "of": ["top"], "reference": "maximum-inscribed"}, "has no maximum-inscribed"),
+        ],
+    )
+    def test_a_measurand_that_says_two_things(self, document, change, words):
+        document["measurands"] = [{"name": "m", **change}]
+        with pytest.raises(InputError, match=words):
+            plan_from(document)
+
+    def test_a_feature_that_has_no_such_reference(self, document):
+        document["features"]["top"]["reference"] = "minimum-circumscribed"
+        with pytest.raises(InputError, match="no minimum-circumscribed"):
+            plan_from(document)
 
     def test_another_schema(self, document):
         with pytest.raises(SchemaVersionError):

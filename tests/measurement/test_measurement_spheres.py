@@ -63,6 +63,7 @@ def plan(calibrated, **changes):
                 "diameter_mm": DIAMETER,
                 "safety_mm": 0.15,
                 "tolerance_mm": 0.2,
+                "u_distance_mm": 0.0003,
                 "mpe_distance": {"A_um": 9.0, "K": 50.0},
                 **changes,
             },

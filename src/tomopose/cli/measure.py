@@ -2,21 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tomopose.cli.common import OK, USAGE, ForceOption, JsonOption, QuietOption, Say, arguments
+from tomopose.cli.common import NOT_TRUSTWORTHY, OK, USAGE, arguments
+from tomopose.cli.options import WritingOptions, add_command
 
-EPILOG = "Example: tomopose measure plan.toml --volume before=scan1.h5 --volume after=scan2.h5 --out measured"
+if TYPE_CHECKING:
+    from tomopose.measurement.alignment import Alignment
+    from tomopose.measurement.mesh.comparison import Comparison
+    from tomopose.measurement.mesh.mesh import Mesh
+    from tomopose.measurement.plan import MeasurementPlan
+    from tomopose.measurement.results import MeasurementResults
+    from tomopose.measurement.uncertainty import Simulated
+    from tomopose.volume import Volume
+
+EPILOG = (
+    "Example: tomopose measure plan.toml --volume before=scan1.h5 --volume after=scan2.h5 --out measured\n\n"
+    "Acceptance test: tomopose measure spheres.toml --volume scan.h5 --protocol --out acceptance"
+)
 FITS = ("none", "datum", "best-fit")
 BETWEEN = ("cells", "natural")
+WRITTEN = (
+    *(f"comparison.{suffix}" for suffix in ("ply", "glb", "vtp", "csv", "json", "png")),
+    *("report.html", "measurement.json", "measurement.csv", "uncertainty.csv"),
+    *("protocol.json", "protocol.csv", "protocol.html"),
+)
+"""Files of an earlier run that --force removes."""
 
 
 def register(app: typer.Typer) -> None:
-    app.command("measure", epilog=EPILOG)(measure)
+    add_command(app, "measure", measure, epilog=EPILOG)
 
 
 def named_files(items: Iterable[str], what: str, *, default: str | None = None) -> dict[str, Path]:
@@ -33,132 +53,164 @@ def named_files(items: Iterable[str], what: str, *, default: str | None = None) 
     return files
 
 
-def measure(
-    plan: Annotated[Path, typer.Argument(help="Measurement plan, TOML.")],
-    volume: Annotated[list[str], typer.Option("--volume", help="Volume file, or NAME=FILE; may be given repeatedly.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder for measurement.json, .csv and report.html.")],
+@dataclass(frozen=True, kw_only=True)
+class Options(WritingOptions):
+    """The options of `tomopose measure`."""
+
+    plan: Annotated[Path, typer.Argument(help="Measurement plan, TOML.")]
+    volume: Annotated[list[str], typer.Option("--volume", help="Volume file, or NAME=FILE; may be given repeatedly.")]
+    out: Annotated[Path, typer.Option("--out", help="Folder for measurement.json, .csv and report.html.")]
     reference: Annotated[
         Path | None, typer.Option("--reference", help="STL, PLY or STEP, mm, watertight: nominal-actual comparison.")
-    ] = None,
+    ] = None
     fit: Annotated[
         str, typer.Option("--fit", help="Alignment to the reference: none (as the plan says), datum or best-fit.")
-    ] = "none",
+    ] = "none"
     edge_mm: Annotated[
         float | None, typer.Option("--edge-mm", min=0.0, help="Divide the reference's triangles to edges this short.")
-    ] = None,
+    ] = None
     probed: Annotated[
         Path | None, typer.Option("--cmm-points", help="CSV x_mm,y_mm,z_mm: shift the reference to probed points.")
-    ] = None,
+    ] = None
     between: Annotated[
         str,
         typer.Option("--cmm-interpolation", help="Between probed points: cells (Voronoi) or natural (blended cells)."),
-    ] = "cells",
-    range_um: Annotated[float, typer.Option("--range-um", min=0.001, help="Colours are clipped at +- so much.")] = 25.0,
+    ] = "cells"
+    range_um: Annotated[float, typer.Option("--range-um", min=0.001, help="Colours are clipped at +- so much.")] = 25.0
     search_mm: Annotated[
         float | None, typer.Option("--search-mm", min=0.0, help="How far surface and reference may lie apart.")
-    ] = None,
+    ] = None
     calibration: Annotated[
         list[str] | None,
         typer.Option("--calibration", help="calibration.json, or VOLUME=FILE: its share in the uncertainty."),
-    ] = None,
+    ] = None
     poses: Annotated[
         list[str] | None, typer.Option("--poses", help="The scan's poses.csv, or VOLUME=FILE; with --calibration.")
-    ] = None,
+    ] = None
     scene: Annotated[
         Path | None, typer.Option("--simulate", help="scene.toml of the nominal object's scan: uncertainty by draws.")
-    ] = None,
-    draws: Annotated[int, typer.Option("--draws", min=3, help="Virtual scans for --simulate.")] = 20,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the virtual scans.")] = 0,
+    ] = None
+    draws: Annotated[int, typer.Option("--draws", min=3, help="Virtual scans for --simulate.")] = 20
+    protocol: Annotated[
+        bool,
+        typer.Option("--protocol", help="Fill the acceptance protocol of VDI/VDE 2630-1.3: a plan with [spheres]."),
+    ] = False
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed for the virtual scans.")] = 0
     coarser: Annotated[
         float, typer.Option("--simulate-voxel", min=1.0, help="Voxels of virtual scans, in those of the volume.")
-    ] = 1.0,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> int:
+    ] = 1.0
+
+    def usage_faults(self) -> list[str]:
+        """What is wrong with the options by themselves."""
+        found = []
+        if self.fit not in FITS:
+            found.append(f"--fit is {', '.join(FITS)}")
+        if self.between not in BETWEEN:
+            found.append(f"--cmm-interpolation is {', '.join(BETWEEN)}")
+        if bool(self.calibration) != bool(self.poses):
+            found.append("--calibration and --poses belong together")
+        return found
+
+    def recorded(self) -> dict[str, object]:
+        """What the provenance keeps."""
+        return arguments(
+            fit=self.fit,
+            range_um=self.range_um,
+            search_mm=self.search_mm,
+            edge_mm=self.edge_mm,
+            cmm_interpolation=self.between if self.probed else None,
+            draws=self.draws if self.scene else None,
+            simulate_voxel=self.coarser if self.scene else None,
+        )
+
+
+def measure(options: Options) -> int:
     """Measure lengths, form and deviations in one or more volumes, beside calibrated values and permissible errors.
 
-    The uncertainty comes from the fit, from repeats that the plan names, from a calibration's covariance and from
-    virtual scans, each told apart and together.
+    The uncertainty comes from the fit, from repeats that the plan names, from a calibration's covariance, from virtual
+    scans and from what the plan states, each by itself and together. Exit code 3 where a limit is exceeded by more than
+    the uncertainty.
     """
     from dataclasses import replace
 
     from tomopose.files import atomic_folder, require_absent
     from tomopose.io.volume_files import read_volume
     from tomopose.measurement.measure import measure as carry_out
-    from tomopose.measurement.mesh.comparison_files import FILES
     from tomopose.measurement.plan import read_plan
     from tomopose.measurement.results import write_results
     from tomopose.provenance import provenance
     from tomopose.report.page import write_report
     from tomopose.report.pages.measurement_page import measurement_report
 
-    say = Say(json=as_json, quiet=quiet)
-    if fit not in FITS:
-        say.note(f"--fit is {', '.join(FITS)}")
-        return USAGE
-    if between not in BETWEEN:
-        say.note(f"--cmm-interpolation is {', '.join(BETWEEN)}")
-        return USAGE
-    if bool(calibration) != bool(poses):
-        say.note("--calibration and --poses belong together")
+    o, say = options, options.say
+    faults = o.usage_faults()
+    if faults:
+        say.note("; ".join(faults))
         return USAGE
     for name in ("report.html", "measurement.json"):
-        require_absent(out / name, force=force)
-    wanted = read_plan(plan)
-    files = named_files(volume, "volume")
-    mesh = None if reference is None else reference_of(reference, edge_mm, probed, between)
+        require_absent(o.out / name, force=o.force)
+    plan = read_plan(o.plan)
+    files = named_files(o.volume, "volume")
+    mesh = None if o.reference is None else reference_of(o.reference, o.edge_mm, o.probed, o.between)
     volumes = {name: read_volume(file) for name, file in files.items()}
     calibrations, scans = (
-        named_files(x or (), w, default="") for x, w in ((calibration, "calibration"), (poses, "poses"))
+        named_files(x or (), w, default="") for x, w in ((o.calibration, "calibration"), (o.poses, "poses"))
     )
-    given = [plan, *files.values(), *calibrations.values(), *scans.values()]
+    given = [o.plan, *files.values(), *calibrations.values(), *scans.values()]
     made = provenance(
-        inputs=[*given, *(p for p in (reference, probed, scene) if p is not None)],
-        seed=seed if scene else None,
-        arguments=arguments(
-            fit=fit,
-            range_um=range_um,
-            search_mm=search_mm,
-            edge_mm=edge_mm,
-            cmm_interpolation=between if probed else None,
-            draws=draws if scene else None,
-            simulate_voxel=coarser if scene else None,
-        ),
+        inputs=[*given, *(p for p in (o.reference, o.probed, o.scene) if p is not None)],
+        seed=o.seed if o.scene else None,
+        arguments=o.recorded(),
     )
     with say.progress("measuring") as progress:
-        results = carry_out(volumes, wanted, provenance=made, progress=progress)
+        results = carry_out(volumes, plan, provenance=made, progress=progress)
     if calibrations:
-        results = replace(results, calibration_u=calibration_u(results, wanted, calibrations, scans))
-    if scene is not None:
-        with say.progress("virtual scans") as progress:
-            drawn = simulated(
-                scene,
-                wanted,
-                next(iter(volumes.values())),
-                calibrations,
-                draws=draws,
-                seed=seed,
-                coarser=coarser,
-                progress=progress,
-            )
-        results = replace(results, simulated=drawn)
+        results = replace(results, calibration_u=calibration_u(results, plan, calibrations, scans))
+    if o.scene is not None:
+        results = replace(results, simulated=simulated(o, o.scene, plan, next(iter(volumes.values())), calibrations))
     comparisons = {}
-    old = (*FILES, "comparison.png", "report.html", "measurement.json", "measurement.csv", "uncertainty.csv")
-    with atomic_folder(out, force=force, stale=old) as folder:
-        if mesh is not None:
-            for name, one in volumes.items():
-                comparisons[name] = compared(one, mesh, results.alignments[name], fit=fit, search_mm=search_mm)
-                place = folder / name if len(volumes) > 1 else folder
-                write_comparison_to(place, comparisons[name], range_um / 1000, name)
-        write_results(results, folder, force=True)
-        page = measurement_report(results, comparisons=comparisons, range_mm=range_um / 1000)
+    with atomic_folder(o.out, force=o.force, stale=WRITTEN) as folder:
+        for name, one in volumes.items() if mesh is not None else ():
+            comparisons[name] = compared(one, mesh, results.alignments[name], fit=o.fit, search_mm=o.search_mm)
+            place = folder / name if len(volumes) > 1 else folder
+            write_comparison_to(place, comparisons[name], o.range_um / 1000, name)
+        protocols = protocols_of(o, results, plan, folder)
+        write_results(folder, results, force=True)
+        page = measurement_report(results, comparisons=comparisons, range_mm=o.range_um / 1000)
         write_report(folder / "report.html", page)
-    say.result(*told(out, results, comparisons))
-    return OK
+    summary, lines = told(o.out, results, comparisons)
+    summary["protocols"] = protocols
+    say.result(summary, [*lines, *(f"  protocol of {v}: {_in_words(d)}" for v, d in protocols.items())])
+    failed = any("not conforming" in d.values() for d in protocols.values())
+    return NOT_TRUSTWORTHY if failed or results.out_of_limits else OK
 
 
-def reference_of(path: Path, edge_mm: float | None, probed: Path | None, between: str) -> Any:
+def protocols_of(
+    o: Options, results: MeasurementResults, plan: MeasurementPlan, out: Path
+) -> dict[str, dict[str, str]]:
+    """Acceptance protocols written into a folder that is being made: volume -> quantity -> decision."""
+    if not o.protocol:
+        return {}
+    from tomopose.measurement.acceptance.protocol import DEFINITIONS, acceptance_protocol, write_protocol
+    from tomopose.report.page import write_report
+    from tomopose.report.pages.protocol_page import protocol_report
+
+    made = {name: acceptance_protocol(results, plan, name) for name in results.volumes}
+    found: dict[str, dict[str, str]] = {}
+    for name, protocol in made.items():
+        folder = out / name if len(made) > 1 else out
+        write_protocol(folder, protocol, force=True)
+        write_report(folder / "protocol.html", protocol_report(protocol))
+        decisions = {q: protocol.decision(q) for q in DEFINITIONS}
+        found[name] = {q: "no limit" if d is None else d.value for q, d in decisions.items()}
+    return found
+
+
+def _in_words(decisions: Mapping[str, str]) -> str:
+    return ", ".join(f"{quantity} {decision}" for quantity, decision in decisions.items())
+
+
+def reference_of(path: Path, edge_mm: float | None, probed: Path | None, between: str) -> Mesh:
     """The reference mesh, of smaller triangles and corrected by probed points where that is asked for."""
     from tomopose.measurement.mesh.cmm_correction import corrected_reference, read_probed_points
     from tomopose.measurement.mesh.mesh import read_mesh
@@ -172,7 +224,7 @@ def reference_of(path: Path, edge_mm: float | None, probed: Path | None, between
     return corrected_reference(mesh, read_probed_points(probed), interpolation=between)  # type: ignore[arg-type]
 
 
-def compared(volume: Any, mesh: Any, alignment: Any, *, fit: str, search_mm: float | None) -> Any:
+def compared(volume: Volume, mesh: Mesh, alignment: Alignment, *, fit: str, search_mm: float | None) -> Comparison:
     """The comparison, from the alignment that the plan gave."""
     from tomopose.errors import InputError
     from tomopose.measurement.mesh.comparison import compare
@@ -184,19 +236,19 @@ def compared(volume: Any, mesh: Any, alignment: Any, *, fit: str, search_mm: flo
     )
 
 
-def write_comparison_to(folder: Path, comparison: Any, range_mm: float, name: str) -> None:
+def write_comparison_to(folder: Path, comparison: Comparison, range_mm: float, name: str) -> None:
     """Mesh files, tables and the picture of one comparison, into a folder that is being made."""
     from tomopose.files import atomic_file
     from tomopose.measurement.mesh.comparison_files import write_comparison
     from tomopose.report.figures.measurement_png import comparison_png
 
-    write_comparison(comparison, folder, range_mm=range_mm, force=True)
+    write_comparison(folder, comparison, range_mm=range_mm, force=True)
     with atomic_file(folder / "comparison.png") as temporary:
         temporary.write_bytes(comparison_png(comparison, range_mm=range_mm, title=name))
 
 
 def calibration_u(
-    results: Any, plan: Any, calibrations: dict[str, Path], scans: dict[str, Path]
+    results: MeasurementResults, plan: MeasurementPlan, calibrations: dict[str, Path], scans: dict[str, Path]
 ) -> dict[str, dict[str, float]]:
     """Volume -> measurand -> standard uncertainty from its calibration; the file without a name serves all others."""
     import tomopose as tp
@@ -215,16 +267,8 @@ def calibration_u(
 
 
 def simulated(
-    scene: Path,
-    plan: Any,
-    volume: Any,
-    calibrations: dict[str, Path],
-    *,
-    draws: int,
-    seed: int,
-    coarser: float,
-    progress: Any,
-) -> Any:
+    o: Options, scene: Path, plan: MeasurementPlan, volume: Volume, calibrations: dict[str, Path]
+) -> Mapping[str, Simulated]:
     """Errors over virtual scans on the volume's own grid, or a coarser one over the same box."""
     import tomopose as tp
     from tomopose.cli.simulated import run_of
@@ -233,38 +277,50 @@ def simulated(
     run = run_of(tp.read_scene(scene), scene)
     file = next(iter(calibrations.values()), None)
     grid = volume.grid
-    shape = tuple(max(round(n / coarser), 2) for n in grid.shape)
-    box = tp.VoxelGrid(shape=shape, spacing=grid.spacing * coarser, centre=grid.centre)
-    return simulated_errors(
-        run,
-        plan,
-        box,
-        draws=draws,
-        seed=seed,
-        progress=progress,
-        calibration=None if file is None else tp.read_calibration(file),
-    )
+    n_z, n_y, n_x = (max(round(n / o.coarser), 2) for n in grid.shape)
+    box = tp.VoxelGrid(shape=(n_z, n_y, n_x), spacing=grid.spacing * o.coarser, centre=grid.centre)
+    with o.say.progress("virtual scans") as progress:
+        return simulated_errors(
+            run,
+            plan,
+            box,
+            draws=o.draws,
+            seed=o.seed,
+            progress=progress,
+            calibration=None if file is None else tp.read_calibration(file),
+        )
 
 
-def told(out: Path, results: Any, comparisons: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+def told(
+    out: Path, results: MeasurementResults, comparisons: Mapping[str, Comparison]
+) -> tuple[dict[str, Any], list[str]]:
     """The summary for programs, and its lines for people."""
-    beyond = results.out_of_limits
-    judged = sum(r.within is not None for r in results.results)
+    from tomopose.measurement.result import Decision
+
+    beyond, open_ = results.decided(Decision.NOT_CONFORMING), results.decided(Decision.NOT_DECIDABLE)
+    judged = len(beyond) + len(open_) + len(results.decided(Decision.CONFORMING))
     lines = [
         f"{out}: {len(results)} results of {len(results.volumes)} volume(s); "
-        + (f"{len(beyond)} of {judged} beyond their limit" if judged else "no limits given")
+        + (
+            f"of {judged} with a limit {judged - len(beyond) - len(open_)} conform, {len(beyond)} do not and "
+            f"{len(open_)} cannot be decided"
+            if judged
+            else "no limits given"
+        )
     ]
-    lines += [
-        f"  {r.volume} {r.name}: {r.value:.5f} {r.unit}, error {1000 * (r.error or 0.0):+.2f} um, limit "
-        f"{1000 * (r.limit or 0.0):.2f} um"
-        for r in beyond[:10]
-    ]
+    for b in [*beyond[:10], *open_[:10]]:
+        scale, unit = (1000.0, "um") if b.unit == "mm" else (1e6, "urad")
+        lines.append(
+            f"  {b.decision.value if b.decision else ''}: {b.volume} {b.name}: error {scale * (b.error or 0.0):+.2f} "
+            f"+- {scale * b.U_error:.2f} {unit}"
+        )
     summary = {
         "out": out.name,
         "results": len(results),
         "volumes": list(results.volumes),
         "judged": judged,
-        "beyond_limits": [r.name for r in beyond],
+        "beyond_limits": [b.name for b in beyond],
+        "not_decidable": [b.name for b in open_],
         "scale": dict(results.scale),
         "alignments": {n: a.to_json() for n, a in results.alignments.items()},
         "comparisons": {n: c.to_json() for n, c in comparisons.items()},

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from tomopose.calibration.result import Calibration, Observability, Parameter
+from tomopose.coverage import expanded_k2
 from tomopose.errors import FileError, InputError
 from tomopose.files import read_json, require_absent, write_json
 from tomopose.geometry.frames import Frame
@@ -19,8 +20,6 @@ from tomopose.io.numbers_json import decode_array, encode
 from tomopose.io.scanner_json import scanner_document, scanner_from_document
 from tomopose.provenance import Provenance
 
-COVERAGE = 2.0
-"""k of the expanded uncertainties."""
 ANGLES_TOLERANCE = 1e-9
 
 
@@ -50,7 +49,7 @@ def calibration_document(cal: Calibration) -> dict[str, Any]:
                 "value": encode(p.value),
                 "unit": p.unit,
                 "standard_uncertainty": encode(p.u),
-                "expanded_uncertainty_k2": encode(COVERAGE * p.u),
+                "expanded_uncertainty_k2": encode(expanded_k2(p.u)),
             }
             for p in cal.parameters
         ],

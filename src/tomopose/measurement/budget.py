@@ -19,23 +19,34 @@ with 95 % probability, whatever n, if its error is one more of the same kind.  T
 more than 95 %, and is not taken.  Where the scan is noisier than the virtual ones beyond chance (F-test at 1 %), the
 scene does not describe it: then the difference is added in squares, and said.  The mean error is taken off the value;
 not off a form deviation, which noise makes larger, never smaller.
+
+What no scan shows is stated in the plan and added in squares: the workpiece (u_w), the temperature, and to errors the
+calibration of the reference (u_cal) and its drift since then (u_drift), as VDI/VDE 2630-2.1 lists them.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from tomopose.coverage import combined, expanded
+from tomopose.measurement.result import (
+    FIT_ALONE,
+    Decision,
+    MeasurementResult,
+    Repeat,
+    decided,
+    reference_shares,
+    value_shares,
+)
 from tomopose.measurement.uncertainty import Simulated
 
-if TYPE_CHECKING:
-    from tomopose.measurement.results import MeasurementResult, Repeat
-
-COVERAGE = 0.95
 CHANCE = 0.01
 """Probability at which a scan is taken as noisier than the virtual ones although it is not."""
-FIT_ALONE = "fit alone, without the systematic part"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +55,11 @@ class Budget:
 
     value:      as measured;  mean_error: of the simulated scans, None without truth and for form;
     corrected:  the value with the mean error taken off, about which the interval lies;
-    u, dof, U:  combined standard uncertainty, its degrees of freedom, half width of the 95 % interval;
-    interval:   what the interval holds and what it does not, in words.
+    workpiece, temperature, drift: as the plan states them; drift is that of the reference and belongs to the error;
+    u, dof, U:  combined standard uncertainty of the value, its degrees of freedom, half width of the 95 % interval;
+    interval:   what the interval holds and what it does not, in words;
+    error, U_error: corrected value minus reference (for an MPE: measured value minus reference) and the half width of
+                its 95 % interval, with the reference's own uncertainty;  decision: after ISO 14253-1.
     """
 
     volume: str
@@ -56,25 +70,25 @@ class Budget:
     repeats: float | None
     calibration: float | None
     simulation: float | None
+    workpiece: float | None
+    temperature: float | None
+    drift: float | None
     mean_error: float | None
     corrected: float
     u: float
     dof: float
     interval: str
+    error: float | None
+    U_error: float
+    decision: Decision | None
 
     @property
     def U(self) -> float:
-        return half_width(self.u, self.dof)
+        return expanded(self.u, self.dof)
 
     def to_json(self) -> dict[str, Any]:
-        return {**vars(self), "U95": self.U}
-
-
-def half_width(u: float, dof: float) -> float:
-    """Half width of the 95 % interval of u by Student's t."""
-    from scipy.stats import t
-
-    return float(t.ppf(0.5 + COVERAGE / 2, dof) * u) if math.isfinite(u) else math.nan
+        decision = None if self.decision is None else self.decision.value
+        return {**vars(self), "U95": self.U, "decision": decision}
 
 
 def budget(
@@ -103,8 +117,14 @@ def budget(
         # The calibration's share is taken as well known.
         shares.append((c, math.inf))
         words.append("calibration")
-    u, dof = _together(shares)
+    shares += value_shares(result)
+    words += [name for name in ("workpiece", "temperature") if name in result.stated]
     known = math.isfinite(result.u) or s is not None or simulated is not None
+    u, dof = combined(shares) if known else (math.nan, math.inf)
+    corrected = result.value - (mean_error or 0.0)
+    permissible = result.limit_rule == "MPE"
+    judged = [scatter if known else (math.nan, math.inf), *value_shares(result)] if permissible else [(u, dof)]
+    error = None if result.reference is None else (result.value if permissible else corrected) - result.reference
     return Budget(
         volume=result.volume,
         name=result.name,
@@ -114,11 +134,48 @@ def budget(
         repeats=s,
         calibration=calibration,
         simulation=None if simulated is None else simulated.u,
+        workpiece=result.stated.get("workpiece"),
+        temperature=result.stated.get("temperature"),
+        drift=result.stated.get("drift"),
         mean_error=mean_error,
-        corrected=result.value - (mean_error or 0.0),
-        u=u if known else math.nan,
+        corrected=corrected,
+        u=u,
         dof=dof,
         interval=_in_words(words, simulated, mean_error) if known else "not determined",
+        error=error,
+        U_error=math.nan if error is None else expanded(*combined([*judged, *reference_shares(result)])),
+        decision=None if error is None else decided(result, error, judged),
+    )
+
+
+def repeat_of(group: str, rows: Sequence[MeasurementResult]) -> Repeat:
+    """The repeats of one measurand: rows of at least two volumes of a group."""
+    values = np.array([r.value for r in rows])
+    n, first = len(rows), rows[0]
+    mean, s = float(values.mean()), float(values.std(ddof=1))
+    finite = [(r.u, r.dof) for r in rows if math.isfinite(r.u)]
+    u_fit = float(np.mean([u for u, _ in finite])) if finite else 0.0
+    # The spread of repeats holds the fit's noise already; the larger of the two stands for both.
+    own = (s, n - 1.0) if s >= u_fit else (u_fit, float(sum(dof for _, dof in finite)))
+    stated = value_shares(first)
+    b = None if first.reference is None or not first.calibrated else mean - first.reference
+    U = expanded(*combined([own, *stated, *(reference_shares(first) if b is not None else [])]))
+    held = ", ".join(["repeats", *(name for name in ("workpiece", "temperature") if name in first.stated)])
+    if b is not None and math.isnan(first.u_reference):
+        systematic = "not determined, the reference's uncertainty is not stated"
+    else:
+        systematic = "without the systematic part" if b is None else "mean error from the reference"
+    return Repeat(
+        group=group,
+        name=first.name,
+        n=n,
+        mean=mean,
+        s=s,
+        unit=first.unit,
+        error=None if first.reference is None else mean - first.reference,
+        U=U + (0.0 if b is None else abs(b)),
+        U_mean=expanded(*combined([(own[0] / math.sqrt(n), own[1]), *stated])),
+        interval=f"{held}; {systematic}",
     )
 
 
@@ -149,15 +206,6 @@ def _beyond_chance(u: float, dof: float, expected: float, dof_expected: float) -
     from scipy.stats import f
 
     return u > expected * math.sqrt(float(f.isf(CHANCE, min(dof, 1e6), min(max(dof_expected, 1.0), 1e6))))
-
-
-def _together(shares: list[tuple[float, float]]) -> tuple[float, float]:
-    """Root of the sum of squares, and the degrees of freedom by Welch and Satterthwaite (JCGM 100:2008, G.4)."""
-    if len(shares) == 1:
-        return shares[0]
-    u = math.hypot(*(u for u, _ in shares))
-    weight = sum(u_i**4 / dof for u_i, dof in shares)
-    return u, u**4 / weight if weight > 0 else math.inf
 
 
 def _in_words(shares: list[str], simulated: Simulated | None, mean_error: float | None) -> str:

@@ -1,21 +1,19 @@
-"""Results of a measurement: one row a measurand and volume, comparable with calibrated values."""
+"""Results of a measurement: one row for each measurand and volume, with groups of repeats and their uncertainties."""
 
 from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from tomopose.files import atomic_folder, write_json, write_text
 from tomopose.measurement.alignment import Alignment
-from tomopose.measurement.budget import FIT_ALONE, Budget, budget, half_width
+from tomopose.measurement.budget import Budget, budget, repeat_of
 from tomopose.measurement.features.feature import Feature
+from tomopose.measurement.result import Decision, MeasurementResult, Repeat
 from tomopose.measurement.uncertainty import Simulated
 from tomopose.provenance import Provenance
 
@@ -32,9 +30,13 @@ COLUMNS = (
     "u_reference",
     "error",
     "limit",
+    "decision",
     "within",
     "direction",
     "method",
+    "association",
+    "n_points",
+    "n_set_aside",
     "interval",
 )
 BUDGET_COLUMNS = (
@@ -46,101 +48,19 @@ BUDGET_COLUMNS = (
     "repeats",
     "calibration",
     "simulation",
+    "workpiece",
+    "temperature",
+    "drift",
     "mean_error",
     "corrected",
     "u",
     "dof",
     "U95",
+    "error",
+    "U_error",
+    "decision",
     "interval",
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class MeasurementResult:
-    """One measurand in one volume.
-
-    value, u:     mm or rad as `unit` says; u is the standard uncertainty, nan where it cannot be determined.
-    dof:          degrees of freedom of u.
-    reference:    calibrated value, else the nominal one, else None; u_reference: its standard uncertainty.
-    limit:        largest permitted |value - reference|: the MPE or the tolerance; None where none is given.
-    direction:    unidirectional | bidirectional | one-sided (only one end is a surface).
-    contributions: standard uncertainties that u is made of.
-    """
-
-    name: str
-    kind: str
-    value: float
-    u: float
-    unit: str
-    method: str
-    direction: str
-    volume: str = ""
-    dof: float = math.inf
-    reference: float | None = None
-    u_reference: float = 0.0
-    limit: float | None = None
-    limit_rule: str = ""
-    contributions: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def error(self) -> float | None:
-        """value - reference, or None."""
-        return None if self.reference is None else self.value - self.reference
-
-    @property
-    def U(self) -> float:
-        """Half width of the 95 % interval of the value by the fit alone, by Student's t; `interval` says so."""
-        return half_width(self.u, self.dof)
-
-    @property
-    def interval(self) -> str:
-        """What U holds, in words."""
-        return FIT_ALONE if math.isfinite(self.u) else "not determined"
-
-    @property
-    def within(self) -> bool | None:
-        """Whether |error| keeps the limit; None without reference or limit."""
-        return None if self.error is None or self.limit is None else abs(self.error) <= self.limit
-
-    def to_json(self) -> dict[str, Any]:
-        return {
-            "volume": self.volume,
-            "name": self.name,
-            "kind": self.kind,
-            "value": self.value,
-            "u": self.u,
-            "U95": self.U,
-            "dof": self.dof,
-            "unit": self.unit,
-            "reference": self.reference,
-            "u_reference": self.u_reference,
-            "error": self.error,
-            "limit": self.limit,
-            "limit_rule": self.limit_rule,
-            "within": self.within,
-            "direction": self.direction,
-            "method": self.method,
-            "interval": self.interval,
-            "contributions": dict(self.contributions),
-        }
-
-
-@dataclass(frozen=True, kw_only=True)
-class Repeat:
-    """A measurand over a group of repeats: mean, standard deviation s, expanded uncertainty after VDI/VDE 2630-2.1:
-
-    U = k sqrt(u_cal^2 + s^2) + |b|, k = 2, b the mean error, where a reference is given; `interval` says what U holds.
-    """
-
-    group: str
-    name: str
-    n: int
-    mean: float
-    s: float
-    unit: str
-    error: float | None
-    U: float
-    interval: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,10 +100,11 @@ class MeasurementResults:
     def repeats(self) -> tuple[Repeat, ...]:
         """Each measurand over each group of at least two volumes."""
         return tuple(
-            _repeat(group, name, rows)
+            repeat_of(group, rows)
             for group, volumes in self.groups.items()
             if len(volumes) > 1
-            for name, rows in _by_name(r for r in self.results if r.volume in volumes).items()
+            for rows in _by_name(r for r in self.results if r.volume in volumes).values()
+            if len(rows) > 1
         )
 
     def budgets(self) -> tuple[Budget, ...]:
@@ -200,9 +121,26 @@ class MeasurementResults:
             for r in self.results
         )
 
+    def decided(self, decision: Decision) -> tuple[Budget, ...]:
+        """Results with a limit about which this was decided, by all that is known of their uncertainty."""
+        return tuple(b for b in self.budgets() if b.decision is decision)
+
     @property
     def out_of_limits(self) -> tuple[MeasurementResult, ...]:
-        return tuple(r for r in self.results if r.within is False)
+        """Results that exceed their limit by more than their uncertainty."""
+        beyond = {(b.volume, b.name) for b in self.decided(Decision.NOT_CONFORMING)}
+        return tuple(r for r in self.results if (r.volume, r.name) in beyond)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Each result as JSON, with the decision by all that is known of its uncertainty."""
+        return [
+            r.to_json()
+            | {
+                "decision": None if b.decision is None else b.decision.value,
+                "within": None if b.decision is None else b.decision.within,
+            }
+            for r, b in zip(self.results, self.budgets(), strict=True)
+        ]
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -212,7 +150,7 @@ class MeasurementResults:
             "scale": dict(self.scale),
             "groups": {g: list(v) for g, v in self.groups.items()},
             "alignments": {v: a.to_json() for v, a in self.alignments.items()},
-            "results": [r.to_json() for r in self.results],
+            "results": self.rows(),
             "repeats": [vars(r) for r in self.repeats()],
             "uncertainty": [b.to_json() for b in self.budgets()],
             "simulated": {n: vars(s) for n, s in self.simulated.items()},
@@ -222,7 +160,7 @@ class MeasurementResults:
         }
 
     def to_csv(self) -> str:
-        return _table(COLUMNS, [r.to_json() for r in self.results])
+        return _table(COLUMNS, self.rows())
 
     def budgets_csv(self) -> str:
         """Shares of the uncertainty, one row a result."""
@@ -240,12 +178,12 @@ def _table(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
     return text.getvalue()
 
 
-def write_results(results: MeasurementResults, folder: str | Path, *, force: bool = False) -> None:
-    """measurement.json, measurement.csv and uncertainty.csv into a folder, all or none.
+def write_results(path: str | Path, results: MeasurementResults, *, force: bool = False) -> None:
+    """measurement.json, measurement.csv and uncertainty.csv into the folder `path`, all or none.
 
     FileError where they exist without `force`.
     """
-    with atomic_folder(folder, force=force) as temporary:
+    with atomic_folder(path, force=force) as temporary:
         write_json(temporary / "measurement.json", SCHEMA, results.to_json())
         write_text(temporary / "measurement.csv", results.to_csv())
         write_text(temporary / "uncertainty.csv", results.budgets_csv())
@@ -256,25 +194,3 @@ def _by_name(rows: Iterable[MeasurementResult]) -> dict[str, list[MeasurementRes
     for r in rows:
         found.setdefault(r.name, []).append(r)
     return found
-
-
-def _repeat(group: str, name: str, rows: list[MeasurementResult]) -> Repeat:
-    values = np.array([r.value for r in rows])
-    s = float(values.std(ddof=1)) if len(values) > 1 else math.nan
-    u_fit = float(np.nanmean([r.u for r in rows])) if any(math.isfinite(r.u) for r in rows) else 0.0
-    reference = rows[0].reference
-    error = None if reference is None else float(values.mean()) - reference
-    # The spread of repeats holds the fit's noise already; the larger of the two stands for both.
-    U = 2.0 * math.sqrt(rows[0].u_reference ** 2 + max(s, u_fit) ** 2) + (0.0 if error is None else abs(error))
-    systematic = "without the systematic part" if error is None else "mean error from the reference"
-    return Repeat(
-        group=group,
-        name=name,
-        n=len(rows),
-        mean=float(values.mean()),
-        s=s,
-        unit=rows[0].unit,
-        error=error,
-        U=U,
-        interval=f"repeats; {systematic}",
-    )

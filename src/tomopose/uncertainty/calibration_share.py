@@ -19,9 +19,11 @@ from tomopose.errors import InputError
 from tomopose.geometry.projection import eq5_matrices
 from tomopose.manipulator.error_models import correction
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.measurement.bench import refitted
 from tomopose.measurement.features.feature import Feature
-from tomopose.measurement.measure import evaluate, refitted
+from tomopose.measurement.measure import evaluate
 from tomopose.measurement.plan import MeasurementPlan
+from tomopose.measurement.result import FORMS
 from tomopose.measurement.results import MeasurementResults
 from tomopose.units import Array
 
@@ -29,7 +31,6 @@ NODES = 3
 """Places a side at which the field is worked out; between them it is quadratic."""
 POINTS = 300
 """Points of a feature that are moved."""
-NOT_LINEAR = ("form", "form_95", "form_25")
 
 
 def displacement_field(calibration: Calibration, poses: PoseSequence, x_W: Array) -> Array:
@@ -77,7 +78,7 @@ def calibration_shares(
             at = (x - (low + high) / 2) / half
             dx = 0.0 if shift is None else _quadratic(at) @ shift
             moved[name] = refitted(features[name], x + dx)
-        return {r.name: r.value for r in evaluate(plan, moved, alignment, scale) if r.kind not in NOT_LINEAR}
+        return {r.name: r.value for r in evaluate(plan, moved, alignment, scale) if r.kind not in FORMS}
 
     nominal = measured(None)
     variance = dict.fromkeys(nominal, 0.0)
@@ -88,8 +89,9 @@ def calibration_shares(
 
 
 def _some(feature: Feature) -> Array:
+    """Some of the used points, and all that determine the feature by themselves."""
     x = feature.points[feature.used]
-    return np.asarray(x[:: -(-len(x) // POINTS)])
+    return np.concatenate([feature.points[list(feature.contacts)], x[:: -(-len(x) // POINTS)]])
 
 
 def _quadratic(x: Array) -> Array:

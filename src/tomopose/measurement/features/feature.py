@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -30,13 +30,14 @@ from tomopose.units import Array, float_array
 PARAMETERS = ("x_mm", "y_mm", "z_mm", "n_x", "n_y", "n_z", "radius_mm", "half_angle_rad")
 HAS_DIRECTION = ("plane", "line", "circle", "cylinder", "cone")
 HAS_RADIUS = ("circle", "sphere", "calotte", "cylinder", "cone")
+Association = Literal["least-squares", "minimum-zone", "minimum-circumscribed", "maximum-inscribed"]
 N_REPRESENTATIVE = 25
 D95_SHARE = 0.95
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Feature:
-    """A least-squares feature.
+    """A feature fitted to points.
 
     vector:       (8,) as in the module's table; what a kind does not have is nan.
     covariance:   (8, 8) of the vector, zero where the kind has nothing or the value was held.
@@ -45,6 +46,8 @@ class Feature:
     n_effective:  number of independent points that carry the same information as the used ones.
     dof:          degrees of freedom of the covariance; fewer than those points, since their correlation is estimated.
     outlier_rule: in words.
+    association:  the criterion: least-squares, minimum-zone, minimum-circumscribed or maximum-inscribed.
+    contacts:     indices of the points that determine a feature other than the least-squares one.
     """
 
     kind: str
@@ -56,6 +59,8 @@ class Feature:
     n_effective: float
     dof: float
     outlier_rule: str = "none"
+    association: Association = "least-squares"
+    contacts: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("vector", "covariance", "points", "residuals"):
@@ -117,19 +122,28 @@ class Feature:
         return float(np.sqrt(np.mean(self.used_residuals**2)))
 
     @property
+    def n_set_aside(self) -> int:
+        """Points that the outlier rule set aside."""
+        return len(self.used) - self.n_used
+
+    @property
     def form(self) -> float:
-        """Range of the used residuals (largest minus smallest), mm: it grows with the number of points."""
-        return float(np.ptp(self.used_residuals))
+        """Peak-to-valley deviation of *all* points, mm: largest minus smallest residual.
+
+        Of a line whose residuals have no sign: twice the largest, the diameter of the zone about it (ISO 12780-1).
+        It grows with noise and with the number of points.
+        """
+        return form_of(self, "form")
 
     @property
     def form_95(self) -> float:
-        """Width of the narrowest shell that holds 95 % of the used points, mm (D95 %)."""
-        return narrowest_shell(self.used_residuals, D95_SHARE)
+        """Width of the narrowest shell that holds 95 % of all points, mm (D95 %)."""
+        return form_of(self, "form_95")
 
     @property
     def form_25(self) -> float:
-        """Range of 25 representative points, each the mean residual of one patch of used points, mm."""
-        return float(np.ptp(patch_means(self, N_REPRESENTATIVE)))
+        """Range of 25 representative points, each the mean residual of one patch of all points, mm."""
+        return form_of(self, "form_25")
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -138,6 +152,9 @@ class Feature:
             "u": {n: u for n, u, v in zip(PARAMETERS, self.u.tolist(), self.vector, strict=True) if math.isfinite(v)},
             "n_points": len(self.points),
             "n_used": self.n_used,
+            "n_set_aside": self.n_set_aside,
+            "association": self.association,
+            "contacts": self.contacts,
             "n_effective": self.n_effective,
             "dof": self.dof,
             "rms_mm": self.rms,
@@ -154,13 +171,38 @@ def narrowest_shell(residuals: Array, share: float) -> float:
     return float(np.min(ordered[inside - 1 :] - ordered[: len(ordered) - inside + 1]))
 
 
-def patch_means(feature: Feature, n: int) -> Array:
-    """Mean residuals (n,) of patches of even size: cells about n points spread over the feature's used points.
+def form_of(feature: Feature, which: str, *, all_points: bool = True) -> float:
+    """form, form_95 or form_25 of a feature, mm.  all_points False leaves out what the outlier rule set aside."""
+    chosen = np.ones(len(feature.used), dtype=bool) if all_points else feature.used
+    d = feature.residuals[chosen]
+    if which == "form_25":
+        return float(np.ptp(patch_means(feature.points[chosen], d, N_REPRESENTATIVE)))
+    if feature.kind == "line" and d.min() >= 0:
+        # Distances without a sign: the zone is a cylinder about the line.
+        return 2 * float(d.max() if which == "form" else np.sort(d)[max(math.ceil(D95_SHARE * len(d)), 1) - 1])
+    return float(np.ptp(d)) if which == "form" else narrowest_shell(d, D95_SHARE)
+
+
+def noise_range(feature: Feature) -> float:
+    """Largest peak-to-valley deviation, mm, that noise alone makes of a perfect feature, in 95 % of cases.
+
+    The noise is the robust standard deviation of the residuals (median of their sizes), so that a dent does not count
+    as noise; n normal errors keep within +- z, z the normal quantile at 1 - 0.025 / n.
+    """
+    from scipy.special import ndtri
+
+    d = feature.residuals - np.median(feature.residuals)
+    sigma = float(np.median(np.abs(d))) / float(ndtri(0.75))
+    return 2 * sigma * float(ndtri(1 - 0.025 / len(d)))
+
+
+def patch_means(points: Array, residuals: Array, n: int) -> Array:
+    """Mean residuals (n,) of patches of even size: cells about n of the points (m, 3), spread over them.
 
     The seeds come one by one, each the point farthest from those before it, so they depend on nothing but the points.
-    InputError where there are fewer used points than patches.
+    InputError where there are fewer points than patches.
     """
-    x = feature.points[feature.used]
+    x = points
     if len(x) < n:
         raise InputError(f"{len(x)} points cannot form {n} patches; give more points")
     nearest = np.full(len(x), np.inf)
@@ -172,5 +214,5 @@ def patch_means(feature: Feature, n: int) -> Array:
         nearest = np.minimum(nearest, distance)
         seed = int(np.argmax(nearest))
     count = np.bincount(patch, minlength=n)
-    total = np.bincount(patch, weights=feature.used_residuals, minlength=n)
+    total = np.bincount(patch, weights=residuals, minlength=n)
     return total[count > 0] / count[count > 0]

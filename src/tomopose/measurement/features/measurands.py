@@ -16,14 +16,16 @@ where both ends move apart; one-sided where only one end is a surface.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
+from tomopose.coverage import combined
 from tomopose.errors import InputError
-from tomopose.measurement.features.feature import Feature
+from tomopose.measurement.features.feature import Feature, form_of
 from tomopose.units import Array
 
 Kind = Literal["distance", "diameter", "angle", "apex_angle", "form", "form_95", "form_25", "position", "x", "y", "z"]
@@ -86,7 +88,7 @@ def distance(first: Feature, second: Feature, *, rule: Rule = "centroid-of-secon
 def diameter(feature: Feature) -> Measured:
     """Diameter, mm; of a cone at its point."""
     _ = feature.radius
-    return _propagated(lambda a: 2.0 * float(a[6]), (feature,), "mm", "bidirectional", "least squares")
+    return _propagated(lambda a: 2.0 * float(a[6]), (feature,), "mm", "bidirectional", feature.association)
 
 
 def angle(first: Feature, second: Feature) -> Measured:
@@ -105,28 +107,31 @@ def angle(first: Feature, second: Feature) -> Measured:
 def apex_angle(feature: Feature) -> Measured:
     """Full apex angle of a cone, rad."""
     _ = feature.half_angle
-    return _propagated(lambda a: 2.0 * float(a[7]), (feature,), "rad", "unidirectional", "least squares")
+    return _propagated(lambda a: 2.0 * float(a[7]), (feature,), "rad", "unidirectional", feature.association)
 
 
-def form(feature: Feature, which: str) -> Measured:
-    """Form deviation, mm: range of all used points, narrowest shell of 95 % of them, or range of 25 patch means.
+def form(feature: Feature, which: str, *, all_points: bool = True) -> Measured:
+    """Form deviation, mm: range of all points, narrowest shell of 95 % of them, or range of 25 patch means.
 
+    all_points: False leaves out the points that the feature's outlier rule set aside; the method says how many.
     Its uncertainty is not determinable from one surface: noise adds to it on one side only.
     """
+    n = len(feature.points) if all_points else feature.n_used
     words = {
-        "form": f"range of {feature.n_used} points",
-        "form_95": f"95 % of {feature.n_used} points",
-        "form_25": "range of 25 patch means",
+        "form": f"range of {n} points",
+        "form_95": f"95 % of {n} points",
+        "form_25": f"25 patch means of {n} points",
     }
     if which not in words:
-        raise InputError(f"{which!r} is no form deviation; {', '.join(words)} are known")
+        raise InputError(f"{which!r} is not a form deviation; choose one of {', '.join(words)}")
+    aside = "all points" if all_points else f"{feature.n_set_aside} points set aside by {feature.outlier_rule}"
     return Measured(
-        value=float(getattr(feature, which)),
+        value=form_of(feature, which, all_points=all_points),
         u=np.nan,
         dof=np.nan,
         unit="mm",
         direction="bidirectional",
-        method=f"{words[which]} about the least-squares {feature.kind}; outliers: {feature.outlier_rule}",
+        method=f"{words[which]} about the {feature.association} {feature.kind}; {aside}",
     )
 
 
@@ -189,6 +194,9 @@ def _propagated(
     """The value with u^2 = sum over features of g' C g; dof by Welch and Satterthwaite (JCGM 100:2008, G.4)."""
     vectors = [np.array(f.vector) for f in features]
     value = function(*vectors)
+    if any(f.association != "least-squares" for f in features):
+        # Extreme points determine these features; the scatter of one surface does not say how uncertain they are.
+        return Measured(value=value, u=np.nan, dof=np.nan, unit=unit, direction=direction, method=method)
     shares = []
     for k, f in enumerate(features):
         u = np.sqrt(np.diag(f.covariance))
@@ -202,10 +210,5 @@ def _propagated(
             g[i] = (above - function(*moved)) / (2 * h)
         used = g != 0
         shares.append(float(g[used] @ f.covariance[np.ix_(used, used)] @ g[used]))
-    variance = max(sum(shares), 0.0)
-    freedom = [max(f.dof, 1.0) for f in features]
-    weight = sum(s**2 / d for s, d in zip(shares, freedom, strict=True))
-    dof = variance**2 / weight if weight > 0 else min(freedom)
-    return Measured(
-        value=value, u=float(np.sqrt(variance)), dof=float(dof), unit=unit, direction=direction, method=method
-    )
+    u, dof = combined((math.sqrt(max(share, 0.0)), max(f.dof, 1.0)) for share, f in zip(shares, features, strict=True))
+    return Measured(value=value, u=u, dof=dof, unit=unit, direction=direction, method=method)

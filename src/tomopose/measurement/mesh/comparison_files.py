@@ -17,13 +17,13 @@ from tomopose.units import MICROMETRES_PER_MM
 FILES = ("comparison.ply", "comparison.glb", "comparison.vtp", "comparison.csv", "comparison.json")
 
 
-def write_comparison(comparison: Comparison, folder: str | Path, *, range_mm: float, force: bool = False) -> None:
-    """All files of a comparison into a folder, all or none; colours clipped at +-range_mm.
+def write_comparison(path: str | Path, comparison: Comparison, *, range_mm: float, force: bool = False) -> None:
+    """All files of a comparison into the folder `path`, all or none; colours clipped at +-range_mm.
 
     Raises FileError where one exists and `force` is not given, EngineMissingError without cmcrameri.
     """
     colours = comparison.colours(range_mm)
-    with atomic_folder(folder, force=force) as temporary:
+    with atomic_folder(path, force=force) as temporary:
         (temporary / "comparison.ply").write_bytes(ply(comparison, colours))
         (temporary / "comparison.glb").write_bytes(glb(comparison, colours))
         write_text(temporary / "comparison.vtp", vtp(comparison))

@@ -11,6 +11,7 @@ from tomopose.calibration.records.charts import FEWEST_RUNS, ControlChart, contr
 from tomopose.calibration.records.compare import Comparison
 from tomopose.calibration.records.history import Entry
 from tomopose.calibration.records.monitor import Monitoring, monitor
+from tomopose.coverage import K2, expanded_k2
 from tomopose.errors import InputError
 from tomopose.report.page import CARE, GOOD, Block, Figure, Page, Section, Table, Verdict, render
 from tomopose.report.pages.checks_section import probability
@@ -19,7 +20,6 @@ from tomopose.report.words import meaning, number, small_unit, symbol
 from tomopose.units import MICROMETRES_PER_MM, MICRORADIANS_PER_RAD
 
 CHARTED = ("d_rms_px", "t_HT_x", "t_HT_y", "t_HT_z", "phi_HT_x", "phi_HT_y", "phi_HT_z")
-COVERAGE_FACTOR = 2.0
 SCALES: Mapping[str, tuple[float, str]] = {
     "mm": (MICROMETRES_PER_MM, "µm"),
     "rad": (MICRORADIANS_PER_RAD, "µrad"),
@@ -46,7 +46,7 @@ def comparison_report(
                 meaning(name),
                 signed(d, unit),
                 small_unit(u, unit),
-                small_unit(COVERAGE_FACTOR * u, unit),
+                small_unit(expanded_k2(u), unit),
                 f"{z:+.2f}",
                 "–" if np.isnan(p) else probability(p),
             ]
@@ -78,7 +78,7 @@ def comparison_report(
                     "y1": y,
                     "line": {"color": SOFT, "dash": "dash", "width": 1},
                 }
-                for y in (-COVERAGE_FACTOR, COVERAGE_FACTOR)
+                for y in (-K2, K2)
             ],
         ),
         height=330,
@@ -156,7 +156,7 @@ def chart_figure(chart: ControlChart) -> Figure:
         if chart.name == "d_rms_px"
         else {
             "type": "data",
-            "array": COVERAGE_FACTOR * factor * chart.u,
+            "array": K2 * factor * chart.u,
             "thickness": 1.2,
             "width": 3,
             "color": ACCENT,

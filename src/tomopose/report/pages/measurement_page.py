@@ -1,41 +1,31 @@
-"""The report of a measurement: errors beside their limits (figs. 13 to 16), the comparison in colour (fig. 12)."""
+"""The report of a measurement: errors beside their limits, with the decision about each, and where U comes from."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 
 from tomopose.geometry.rotations import log_rotation
-from tomopose.measurement.budget import FIT_ALONE, Budget
+from tomopose.measurement.budget import Budget
 from tomopose.measurement.mesh.comparison import Comparison
-from tomopose.measurement.results import MeasurementResult, MeasurementResults
-from tomopose.report.figures.deviation_picture import vik_scale
-from tomopose.report.page import (
-    BAD,
-    CARE,
-    GOOD,
-    Block,
-    Figure,
-    KeyFigure,
-    Page,
-    Section,
-    Table,
-    Verdict,
-    Words,
-    render,
+from tomopose.measurement.result import FIT_ALONE, Decision, MeasurementResult
+from tomopose.measurement.results import MeasurementResults
+from tomopose.report.figures.measurement_figures import (
+    deviation_histogram,
+    deviation_view,
+    error_bars,
+    errors_by_length,
+    group_bars,
 )
+from tomopose.report.page import BAD, CARE, GOOD, Block, KeyFigure, Page, Section, Table, Verdict, Words, render
 from tomopose.report.pages.provenance_section import provenance_section
-from tomopose.report.style import ACCENT, ALERT, LINE, ORANGE, axis, colour_bar, layout, space_axis
 from tomopose.report.words import NOT_DETERMINABLE, number
 from tomopose.units import MICROMETRES_PER_MM, Array
 
-COLOURS = (ACCENT, ORANGE, "#2b7d4f", "#8a6bb1", "#b2433f", "#4a4a4a")
 MANY = 40
 """Results of one kind from which they are shown by number instead of by name."""
-SHOWN_TRIANGLES = 100_000
 FORM_NAMES = {"form": "all points", "form_95": "95 % of the points", "form_25": "25 patches"}
 
 
@@ -84,24 +74,49 @@ def _um(value: float | None, signed: bool = False) -> str:
 
 
 def _verdict(results: MeasurementResults) -> Verdict:
-    judged = [r for r in results.results if r.within is not None]
-    out = results.out_of_limits
+    beyond, undecided = results.decided(Decision.NOT_CONFORMING), results.decided(Decision.NOT_DECIDABLE)
+    judged = len(beyond) + len(undecided) + len(results.decided(Decision.CONFORMING))
     if not judged:
         return Verdict(word="Measured", sentence="No limits were given, so nothing is judged.", tone=CARE)
-    if out:
-        worst = [
-            f"{r.name} ({r.volume}): {_um(r.error, True)} µm, permitted {_um(r.limit)} µm"
-            if r.unit == "mm"
-            else f"{r.name} ({r.volume})"
-            for r in out[:6]
-        ]
+    rule = "by the 95 % interval of each (ISO 14253-1)"
+    reasons = [_decision_words(b, results) for b in (*beyond, *undecided)[:8]]
+    if beyond:
+        rest = f" {len(undecided)} more cannot be decided." if undecided else ""
         return Verdict(
-            word="Out of limits",
-            sentence=f"{len(out)} of {len(judged)} results exceed their limit.",
+            word="Not conforming",
+            sentence=f"{len(beyond)} of {judged} results with a limit exceed it, {rule}.{rest}",
             tone=BAD,
-            reasons=worst,
+            reasons=reasons,
         )
-    return Verdict(word="Within limits", sentence=f"All {len(judged)} results with a limit keep it.", tone=GOOD)
+    if undecided:
+        return Verdict(
+            word="Not decidable",
+            sentence=f"{len(undecided)} of {judged} results with a limit cannot be decided, {rule}; others conform.",
+            tone=CARE,
+            reasons=reasons,
+        )
+    return Verdict(word="Conforming", sentence=f"All {judged} results with a limit conform, {rule}.", tone=GOOD)
+
+
+def _decision_words(b: Budget, results: MeasurementResults) -> str:
+    """Why one result is not said to conform."""
+    row = next(r for r in results.results if (r.volume, r.name) == (b.volume, b.name))
+    found = f"{b.name} ({b.volume}): error {_shown(b.error, b.unit, signed=True)}"
+    if math.isnan(row.u_reference):
+        return f"{found}, permitted {_shown(row.limit, b.unit)}; the uncertainty of the calibrated value is not stated"
+    if not math.isfinite(b.U_error):
+        return f"{found}, permitted {_shown(row.limit, b.unit)}; its uncertainty is not determined"
+    return f"{found} ± {_shown(b.U_error, b.unit)}, permitted {_shown(row.limit, b.unit)}"
+
+
+def _shown(value: float | None, unit: str, *, signed: bool = False) -> str:
+    """Micrometres or seconds of arc, with the unit."""
+    if value is None or not math.isfinite(value):
+        return NOT_DETERMINABLE
+    if unit == "mm":
+        return f"{_um(value, signed)} µm"
+    seconds = math.degrees(value) * 3600
+    return f"{seconds:+.1f} arcsec" if signed else f"{seconds:.1f} arcsec"
 
 
 def _keys(results: MeasurementResults) -> list[KeyFigure]:
@@ -136,13 +151,15 @@ def _errors(results: MeasurementResults) -> list[Block]:
         rows = [r for r in results.results if r.kind == kind and r.error is not None]
         if rows:
             many = kind == "distance" and len(rows) > MANY * len(results.volumes)
-            blocks.append(_by_length(words, rows, results.volumes) if many else _bars(words, rows, results.volumes))
+            blocks.append(
+                errors_by_length(words, rows, results.volumes) if many else error_bars(words, rows, results.volumes)
+            )
             if results.repeats() and not many:
-                blocks.append(_groups(words, rows, results))
+                blocks.append(group_bars(words, rows, results))
     for kind, words in FORM_NAMES.items():
         rows = [r for r in results.results if r.kind == kind]
         if rows:
-            blocks.append(_bars(f"Form deviation, {words}", rows, results.volumes, of_value=True))
+            blocks.append(error_bars(f"Form deviation, {words}", rows, results.volumes, of_value=True))
     angles = [r for r in results.results if r.unit == "rad" and r.error is not None]
     if angles:
         blocks.append(
@@ -160,164 +177,45 @@ def _errors(results: MeasurementResults) -> list[Block]:
     return blocks or [Words(paragraphs=["No measurand has a reference."])]
 
 
-def _bars(words: str, rows: Sequence[MeasurementResult], volumes: Sequence[str], *, of_value: bool = False) -> Figure:
-    data: list[dict[str, Any]] = []
-    for k, volume in enumerate(volumes):
-        mine = [r for r in rows if r.volume == volume]
-        bars = [r.U if math.isfinite(r.U) else 0.0 for r in mine]
-        data.append(
-            {
-                "type": "bar",
-                "name": volume,
-                "x": [r.name for r in mine],
-                "y": [(r.value if of_value else r.error or 0.0) * MICROMETRES_PER_MM for r in mine],
-                "marker": {"color": COLOURS[k % len(COLOURS)]},
-                "error_y": {
-                    "type": "data",
-                    "array": [b * MICROMETRES_PER_MM for b in bars],
-                    "visible": any(bars),
-                    "thickness": 1.2,
-                },
-                "hovertemplate": "%{x}<br>%{y:.3f} µm<extra></extra>",
-            }
-        )
-    limits = {r.name: r.limit for r in rows if r.limit is not None}
-    for sign in (1, -1) if limits and not of_value else ():
-        data.append(
-            {
-                "type": "scatter",
-                "mode": "lines+markers",
-                "name": "limit",
-                "showlegend": sign > 0,
-                "x": list(limits),
-                "y": [sign * float(v) * MICROMETRES_PER_MM for v in limits.values()],
-                "line": {"color": ALERT, "dash": "dash", "width": 1},
-                "marker": {"size": 4, "color": ALERT},
-                "hovertemplate": "limit %{y:.2f} µm<extra></extra>",
-            }
-        )
-    return Figure(
-        title=words,
-        meaning="Value in micrometres." if of_value else "Error in micrometres, with the 95 % interval of the fit.",
-        look_for="Form grows with noise and with the number of points; compare only what was measured alike."
-        if of_value
-        else "Errors should be even in sign and stay inside the dashed limits.",
-        data=data,
-        layout=layout(xaxis=axis("", type="category"), yaxis=axis("µm"), barmode="group"),
-        height=380,
-    )
-
-
-def _groups(words: str, rows: Sequence[MeasurementResult], results: MeasurementResults) -> Figure:
-    """Mean errors of the groups of repeats and of the volumes that stand alone, side by side (figs. 13 to 16)."""
-    names = list(dict.fromkeys(r.name for r in rows))
-    data: list[dict[str, Any]] = []
-    bars: dict[str, dict[str, tuple[float, float]]] = {}
-    for repeat in results.repeats():
-        if repeat.name in names and repeat.error is not None:
-            bars.setdefault(repeat.group, {})[repeat.name] = (repeat.error, repeat.s)
-    grouped = {v for group in results.groups.values() for v in group}
-    for r in rows:
-        if r.volume not in grouped and r.error is not None:
-            bars.setdefault(r.volume, {})[r.name] = (r.error, math.nan)
-    for k, (group, found) in enumerate(bars.items()):
-        spread = [0.0 if not math.isfinite(s) else s * MICROMETRES_PER_MM for _, s in found.values()]
-        data.append(
-            {
-                "type": "bar",
-                "name": group,
-                "x": list(found),
-                "y": [e * MICROMETRES_PER_MM for e, _ in found.values()],
-                "marker": {"color": COLOURS[k % len(COLOURS)]},
-                "error_y": {"type": "data", "array": spread, "visible": any(spread), "thickness": 1.2},
-                "hovertemplate": "%{x}<br>%{y:.3f} µm<extra></extra>",
-            }
-        )
-    return Figure(
-        title=f"{words}: groups side by side",
-        meaning="Mean error of each group of repeats, with the standard deviation of one; volumes in no group alone.",
-        look_for="Groups that differ by more than their repeats scatter differ for a reason.",
-        data=data,
-        layout=layout(xaxis=axis("", type="category"), yaxis=axis("µm"), barmode="group"),
-        height=380,
-    )
-
-
-def _by_length(words: str, rows: Sequence[MeasurementResult], volumes: Sequence[str]) -> Figure:
-    data: list[dict[str, Any]] = [
-        {
-            "type": "scatter",
-            "mode": "markers",
-            "name": volume,
-            "marker": {"size": 5, "color": COLOURS[k % len(COLOURS)]},
-            "x": [r.reference for r in rows if r.volume == volume],
-            "y": [(r.error or 0.0) * MICROMETRES_PER_MM for r in rows if r.volume == volume],
-            "text": [r.name for r in rows if r.volume == volume],
-            "hovertemplate": "%{text}<br>%{x:.3f} mm<br>%{y:.3f} µm<extra></extra>",
-        }
-        for k, volume in enumerate(volumes)
-    ]
-    limited = sorted(((r.reference or 0.0), r.limit) for r in rows if r.limit is not None)
-    for sign in (1, -1) if limited else ():
-        data.append(
-            {
-                "type": "scatter",
-                "mode": "lines",
-                "name": "MPE",
-                "showlegend": sign > 0,
-                "x": [x for x, _ in limited],
-                "y": [sign * y * MICROMETRES_PER_MM for _, y in limited],
-                "line": {"color": ALERT, "dash": "dash", "width": 1.4},
-                "hoverinfo": "skip",
-            }
-        )
-    return Figure(
-        title=words,
-        meaning="Error of each distance by its calibrated length.",
-        look_for="A line through zero is a scale error; points outside the dashed lines exceed the permissible error.",
-        data=data,
-        layout=layout(xaxis=axis("length / mm"), yaxis=axis("error / µm")),
-        height=420,
-    )
-
-
 def _rows(results: MeasurementResults) -> Table:
-    def cells(r: MeasurementResult) -> list[str]:
-        if r.unit == "mm":
-            shown = [
-                f"{r.value:.5f} mm",
-                _um(r.U) if math.isfinite(r.U) else "–",
-                "–" if r.error is None else _um(r.error, True),
-                "–" if r.limit is None else _um(r.limit),
-            ]
-        else:
-            shown = [
-                f"{math.degrees(r.value):.6f} °",
-                "–",
-                "–" if r.error is None else f"{math.degrees(r.error) * 3600:+.1f} arcsec",
-                "–",
-            ]
-        kept = {True: "yes", False: "no", None: "–"}[r.within]
-        return [r.volume, r.name, *shown, kept, r.direction, r.method]
+    def cells(r: MeasurementResult, b: Budget) -> list[str]:
+        value = f"{r.value:.5f} mm" if r.unit == "mm" else f"{math.degrees(r.value):.6f} °"
+        aside = f"{r.n_set_aside} of {r.n_points}" if r.n_set_aside else "none"
+        return [
+            r.volume,
+            r.name,
+            value,
+            _shown(r.U, r.unit) if math.isfinite(r.U) else "–",
+            "–" if r.error is None else _shown(r.error, r.unit, signed=True),
+            "–" if not math.isfinite(b.U_error) else _shown(b.U_error, b.unit),
+            "–" if r.limit is None else f"{_shown(r.limit, r.unit)} ({r.limit_rule})",
+            "–" if b.decision is None else b.decision.value,
+            aside,
+            r.direction,
+            r.method,
+        ]
 
     return Table(
         title="Rows",
         meaning="U: half width of the 95 % interval from the scatter of the fitted points. It is not the whole "
         "uncertainty: what all scans have in common (attenuation that is not linear, artefacts, the calibration) is "
-        "not in it.",
+        "not in it. U of the error holds what else is known, and the reference's own uncertainty. A result conforms "
+        "where its whole interval keeps the limit (ISO 14253-1).",
         columns=[
             "volume",
             "name",
             "value",
-            f"U / µm ({FIT_ALONE})",
-            "error / µm",
-            "limit / µm",
-            "within",
+            f"U ({FIT_ALONE})",
+            "error",
+            "U of the error",
+            "limit",
+            "decision",
+            "points set aside",
             "direction",
             "method",
         ],
-        rows=[cells(r) for r in results.results],
-        numeric=(2, 3, 4, 5),
+        rows=[cells(r, b) for r, b in zip(results.results, results.budgets(), strict=True)],
+        numeric=(2, 3, 4, 5, 6),
         folded=len(results) > MANY,
     )
 
@@ -329,9 +227,21 @@ def _repeats(results: MeasurementResults) -> list[Block]:
     return [
         Table(
             title="Repeats",
-            meaning="Groups of volumes that repeat one measurement: U = 2 √(u_cal² + s²) + |mean error|.",
-            columns=["group", "name", "n", "mean / mm", "s / µm", "mean error / µm", "U / µm", "holds"],
-            numeric=(2, 3, 4, 5, 6),
+            meaning="Groups of volumes that repeat one measurement. U is that of one further scan: Student's factor "
+            "times the root of the sum of squares of repeats, reference, drift, workpiece and temperature, plus the "
+            "size of the mean error where the reference is calibrated. U of the mean has s / √n in place of s.",
+            columns=[
+                "group",
+                "name",
+                "n",
+                "mean / mm",
+                "s / µm",
+                "mean error / µm",
+                "U / µm",
+                "U of the mean / µm",
+                "holds",
+            ],
+            numeric=(2, 3, 4, 5, 6, 7),
             rows=[
                 [
                     r.group,
@@ -341,6 +251,7 @@ def _repeats(results: MeasurementResults) -> list[Block]:
                     _um(r.s),
                     "–" if r.error is None else _um(r.error, True),
                     _um(r.U),
+                    _um(r.U_mean),
                     r.interval,
                 ]
                 for r in found
@@ -353,13 +264,14 @@ def _repeats(results: MeasurementResults) -> list[Block]:
 def _budgets(results: MeasurementResults) -> list[Section]:
     """Where the uncertainty comes from, where more than the fit is known."""
     found = [b for b in results.budgets() if b.unit == "mm"]
-    if not any((b.repeats, b.calibration, b.simulation) != (None, None, None) for b in found):
+    stated = ("repeats", "calibration", "simulation", "workpiece", "temperature")
+    if not any(getattr(b, name) is not None for b in found for name in stated):
         return []
 
     def cells(b: Budget) -> list[str]:
         shares = [
             "–" if u is None or not math.isfinite(u) else _um(u)
-            for u in (b.fit, b.repeats, b.calibration, b.simulation)
+            for u in (b.fit, b.repeats, b.calibration, b.simulation, b.workpiece, b.temperature)
         ]
         corrected = ["–", "–"] if b.mean_error is None else [_um(b.mean_error, True), f"{b.corrected:.5f}"]
         return [
@@ -390,12 +302,14 @@ def _budgets(results: MeasurementResults) -> list[Section]:
                         "repeats / µm",
                         "calibration / µm",
                         "simulation / µm",
+                        "workpiece / µm",
+                        "temperature / µm",
                         "its mean error / µm",
                         "corrected by simulation / mm",
                         "U / µm",
                         "holds",
                     ],
-                    numeric=tuple(range(2, 10)),
+                    numeric=tuple(range(2, 12)),
                     rows=[cells(b) for b in found],
                     folded=len(found) > MANY,
                 )
@@ -406,7 +320,18 @@ def _budgets(results: MeasurementResults) -> list[Section]:
 
 def _features(results: MeasurementResults) -> Section:
     rows = [
-        [v, name, f.kind, str(f.n_used), f"{f.n_effective:.0f}", _um(f.rms), _um(f.form), _um(f.form_95)]
+        [
+            v,
+            name,
+            f.kind,
+            f.association,
+            str(len(f.points)),
+            str(f.n_set_aside),
+            f"{f.n_effective:.0f}",
+            _um(f.rms),
+            _um(f.form),
+            _um(f.form_95),
+        ]
         for v, found in results.features.items()
         for name, f in found.items()
     ]
@@ -415,10 +340,22 @@ def _features(results: MeasurementResults) -> Section:
         blocks=[
             Table(
                 title="Fitted features",
-                meaning="Effective points: independent ones that carry the same information.",
-                columns=["volume", "name", "kind", "points", "effective", "rms / µm", "range / µm", "D95 / µm"],
+                meaning="Effective points: independent ones that carry the same information; of a feature other than "
+                "the least-squares one, those that determine it. Form and D95 are of all points.",
+                columns=[
+                    "volume",
+                    "name",
+                    "kind",
+                    "reference feature",
+                    "points",
+                    "set aside",
+                    "effective",
+                    "rms / µm",
+                    "form / µm",
+                    "D95 / µm",
+                ],
                 rows=rows,
-                numeric=(3, 4, 5, 6, 7),
+                numeric=(4, 5, 6, 7, 8, 9),
                 folded=len(rows) > MANY,
             )
         ],
@@ -431,60 +368,6 @@ def _notes(results: MeasurementResults) -> list[Block]:
 
 def _comparison(name: str, comparison: Comparison, range_mm: float) -> Section:
     limit = range_mm * MICROMETRES_PER_MM
-    count, centre = comparison.histogram(range_mm)
-    step = max(len(comparison.mesh.faces) // SHOWN_TRIANGLES, 1)
-    faces = comparison.mesh.faces[::step]
-    deviation = comparison.deviation * MICROMETRES_PER_MM
-    x = comparison.points
-    view = Figure(
-        title="Deviations in colour",
-        meaning=f"Measured surface minus reference at the reference's vertices, clipped at ±{limit:g} µm.",
-        look_for="Waves along the circumference follow the trajectory; one colour on a side is size or alignment.",
-        data=[
-            {
-                "type": "mesh3d",
-                "x": np.round(x[:, 0], 4),
-                "y": np.round(x[:, 1], 4),
-                "z": np.round(x[:, 2], 4),
-                "i": faces[:, 0],
-                "j": faces[:, 1],
-                "k": faces[:, 2],
-                "intensity": [None if not math.isfinite(d) else round(float(d), 2) for d in deviation],
-                "cmin": -limit,
-                "cmax": limit,
-                "colorscale": vik_scale(),
-                "colorbar": colour_bar("µm"),
-                "lighting": {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0},
-                "hovertemplate": "%{intensity} µm<extra></extra>",
-            }
-        ],
-        layout=layout(
-            scene={
-                "aspectmode": "data",
-                "xaxis": space_axis("x / mm"),
-                "yaxis": space_axis("y / mm"),
-                "zaxis": space_axis("z / mm"),
-            },
-            margin={"l": 0, "r": 0, "t": 0, "b": 0},
-        ),
-        height=560,
-    )
-    histogram = Figure(
-        title="Histogram",
-        meaning="Vertices by deviation; the outermost bars hold what lies beyond.",
-        look_for="One narrow peak at zero.",
-        data=[
-            {
-                "type": "bar",
-                "x": centre * MICROMETRES_PER_MM,
-                "y": count,
-                "marker": {"color": ACCENT, "line": {"color": LINE, "width": 0}},
-                "hovertemplate": "%{x:.2f} µm: %{y}<extra></extra>",
-            }
-        ],
-        layout=layout(xaxis=axis("deviation / µm"), yaxis=axis("vertices"), bargap=0, showlegend=False),
-        height=320,
-    )
     percentiles = Table(
         title="Percentiles",
         meaning="",
@@ -502,7 +385,8 @@ def _comparison(name: str, comparison: Comparison, range_mm: float) -> Section:
             f"{100 * comparison.share_within(range_mm):.1f} % of {len(comparison.measured)} vertices."
         ],
     )
-    return Section(title=f"Nominal-actual comparison: {name}", blocks=[view, histogram, percentiles, moved])
+    figures = deviation_view(comparison, range_mm), deviation_histogram(comparison, range_mm)
+    return Section(title=f"Nominal-actual comparison: {name}", blocks=[*figures, percentiles, moved])
 
 
 def _vector(x: Array) -> str:

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from tomopose.calibration.result import Calibration, Parameter
+from tomopose.coverage import expanded_k2
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.error_models import moving_scanner
 from tomopose.report.page import Block, Section, Table, Words
 from tomopose.report.words import NOT_GIVEN, cell, heading, meaning, small_unit
 from tomopose.units import value_with_uncertainty
 
-COVERAGE_FACTOR = 2.0
 MANY_PARAMETERS = 12
 MACHINE_LISTS = ("names", "values", "units", "u", "nominal")
 """Parts of `Calibration.manipulator` that stand in the tables of parameters already, or in its input file."""
@@ -76,7 +76,7 @@ def _parameter_table(parameters: Sequence[Parameter], *, title: str, words: str)
                 value_with_uncertainty(p.value, p.u, p.unit),
                 degrees,
                 small_unit(p.u, p.unit),
-                small_unit(COVERAGE_FACTOR * p.u, p.unit),
+                small_unit(expanded_k2(p.u), p.unit),
             ]
         )
     return Table(

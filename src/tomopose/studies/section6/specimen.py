@@ -33,6 +33,8 @@ from tomopose.studies.section6.scan import MOUNTED, specimen
 from tomopose.units import MICROMETRES_PER_MM, Array
 from tomopose.volume import Volume
 
+OUTLIERS = 3.0
+"""Points beyond so many rms are set aside."""
 RIM_MM = 1.0
 """Kept from the rims of the cylinder areas."""
 THREAD_Y_MM = 8.0
@@ -88,7 +90,7 @@ def plan_for(alignment: Alignment, search_mm: float | None = None, sigma_mm: flo
         angle, side = np.radians(60.0 * k), 1.0 if k % 2 else -1.0
         e, across = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([-np.sin(angle), np.cos(angle), 0.0])
         z = np.array([0.0, 0.0, 1.0])
-        plane = {"kind": "plane", "direction": e.tolist(), "n_points": 400}
+        plane = {"kind": "plane", "direction": e.tolist(), "n_points": 400, "outliers": OUTLIERS}
         features[f"flat {k + 1}"] = {
             **plane,
             "point": (FLAT * e - 6.0 * side * z).tolist(),
@@ -112,6 +114,7 @@ def plan_for(alignment: Alignment, search_mm: float | None = None, sigma_mm: flo
             "cap_deg": 80.0,
             "inward": True,
             "n_points": 400,
+            "outliers": OUTLIERS,
         }
     measurands.append({"name": "L7", "kind": "distance", "of": ["calotte 1", "calotte 2"]})
     start = np.column_stack([alignment.R, alignment.t]).tolist()

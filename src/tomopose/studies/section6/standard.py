@@ -19,6 +19,8 @@ CAP_DEG = 150.0
 """From the top: the shaft of 2 mm takes the last 24 deg, and the safety distance of 0.5 mm comes off the cap."""
 POINTS = 400
 SEARCH_VOXELS = 2.0
+OUTLIERS = 3.0
+"""Points beyond so many rms are set aside, in the sphericities too: what a robust evaluation of a surface states."""
 FORMS = ("form", "form_95")
 
 
@@ -34,6 +36,7 @@ def plan_for(search_mm: float, sigma_mm: float) -> MeasurementPlan:
             "cap_deg": CAP_DEG,
             "safety_mm": 0.5,
             "n_points": POINTS,
+            "outliers": OUTLIERS,
         }
         for k, (c, d) in enumerate(zip(centres, diameters, strict=True))
     }
@@ -53,7 +56,7 @@ def plan_for(search_mm: float, sigma_mm: float) -> MeasurementPlan:
                 "name": f"{kind} {k + 1:02d}",
                 "kind": kind,
                 "of": [name],
-                **({"calibrated_mm": float(diameters[k])} if kind == "diameter" else {}),
+                **({"calibrated_mm": float(diameters[k])} if kind == "diameter" else {"points": "kept"}),
             }
             for k, name in enumerate(names)
         ]
