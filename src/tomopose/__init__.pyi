@@ -163,3 +163,21 @@ from .volume import Volume as Volume
 from .volume import VoxelGrid as VoxelGrid
 
 __version__: str
+from .calibration.checks.stability import Effect as Effect
+from .calibration.checks.stability import OutlierBlock as OutlierBlock
+from .calibration.checks.stability import RepeatedPose as RepeatedPose
+from .calibration.checks.stability import Stability as Stability
+from .calibration.checks.verdict import Finding as Finding
+from .calibration.result import Assumed as Assumed
+from .calibration.result import ModelComparison as ModelComparison
+from .calibration.result import ModelJudgement as ModelJudgement
+from .calibration.result import PoseNoiseFound as PoseNoiseFound
+from .calibration.result import RotationResiduals as RotationResiduals
+from .calibration.result import ViewDistances as ViewDistances
+from .manipulator.error_models import EmpiricalErrors as EmpiricalErrors
+from .manipulator.error_models import IdentifiedErrors as IdentifiedErrors
+from .manipulator.error_models import Lag as Lag
+from .manipulator.error_models import PoseRange as PoseRange
+from .manipulator.error_models import PoseScatter as PoseScatter
+from .manipulator.error_models import RigidErrors as RigidErrors
+from .manipulator.error_models import TwinErrors as TwinErrors

@@ -10,7 +10,9 @@ from calibration_cases import BALL, MOUNT, SCANNER, mixed_poses, observe, paper_
 from scipy.spatial import ConvexHull
 
 import tomopose as tp
-from tomopose.calibration.checks.ball_size import require_ball_size, size_ratio
+from tomopose.calibration.build import with_findings
+from tomopose.calibration.checks import ball_size
+from tomopose.calibration.checks.ball_size import ball_size_findings, size_ratio
 from tomopose.calibration.solve import calibrate
 from tomopose.errors import InputError
 
@@ -37,9 +39,9 @@ def run():
 
 def test_size_is_that_of_the_shadow_of_the_balls_own_surface(run):
     poses, observed = run
-    ratio = size_ratio(calibrate(SCANNER, poses, observed), poses, observed, DIAMETER)
-    assert ratio == pytest.approx(1.0, abs=3e-4)
-    assert require_ball_size(ratio, DIAMETER) is None
+    calibration = calibrate(SCANNER, poses, observed)
+    assert size_ratio(calibration, poses, observed, DIAMETER) == pytest.approx(1.0, abs=3e-4)
+    assert ball_size_findings(calibration, poses, observed, DIAMETER) == ()
 
 
 def test_wrong_scale_of_the_translations_that_centres_hide_is_named():
@@ -52,13 +54,27 @@ def test_wrong_scale_of_the_translations_that_centres_hide_is_named():
     assert calibration.chi2 / calibration.dof < 1.3
     ratio = size_ratio(calibration, longer, observed, DIAMETER)
     assert ratio == pytest.approx(1.01, abs=1e-3)
-    assert "the scale of the poses' translations" in str(require_ball_size(ratio, DIAMETER))
+    (finding,) = ball_size_findings(calibration, longer, observed, DIAMETER)
+    assert finding.rule.startswith("size of the ball")
+    assert "the scale of the poses' translations" in finding.words
 
 
 @pytest.mark.parametrize("ratio", [1.021, 0.979])
-def test_more_than_two_per_cent_is_an_error(ratio):
+def test_more_than_two_per_cent_is_an_error(run, ratio, monkeypatch):
+    poses, observed = run
+    monkeypatch.setattr(ball_size, "size_ratio", lambda *_: ratio)
     with pytest.raises(InputError, match=r"2\.1 % (larger|smaller) than a ball of 8 mm"):
-        require_ball_size(ratio, DIAMETER)
+        ball_size_findings(calibrate(SCANNER, poses, observed), poses, observed, DIAMETER)
+
+
+@pytest.mark.parametrize(("ratio", "verdict"), [(1.0049, None), (1.006, "trustworthy"), (0.987, "doubtful")])
+def test_a_smaller_difference_is_a_finding(run, ratio, verdict, monkeypatch):
+    poses, observed = run
+    monkeypatch.setattr(ball_size, "size_ratio", lambda *_: ratio)
+    calibration = calibrate(SCANNER, poses, observed)
+    found = ball_size_findings(calibration, poses, observed, DIAMETER)
+    assert [f.verdict for f in found] == ([] if verdict is None else [verdict])
+    assert with_findings(calibration, found).verdict == (verdict or "trustworthy")
 
 
 def test_wrong_diameter_shows_as_its_ratio(run):
@@ -70,6 +86,6 @@ def test_wrong_diameter_shows_as_its_ratio(run):
 def test_without_sizes_nothing_is_said(run):
     poses, observed = run
     bare = replace(observed, semi_major=None, semi_minor=None)
-    ratio = size_ratio(calibrate(SCANNER, poses, bare), poses, bare, DIAMETER)
-    assert np.isnan(ratio)
-    assert require_ball_size(ratio, DIAMETER) is None
+    calibration = calibrate(SCANNER, poses, bare)
+    assert np.isnan(size_ratio(calibration, poses, bare, DIAMETER))
+    assert ball_size_findings(calibration, poses, bare, DIAMETER) == ()

@@ -88,8 +88,8 @@ def test_quick_rivals_reject_a_calibration():
     cal = calibrate(SCANNER, poses, BallObservations.from_sigma(x, 0.0146, pose_id=poses.pose_id))
     assert cal.verdict == "rejected"
     assert "counted the other way" in cal.reasons[0]
-    assert cal.hypotheses[0]["outcome"] == "better"
-    assert cal.hypotheses[0]["cure"]
+    assert cal.hypotheses[0].outcome == "better"
+    assert cal.hypotheses[0].cure
 
 
 def test_mixed_poses_tell_all_but_the_true_symmetries():

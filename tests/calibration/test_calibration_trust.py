@@ -18,6 +18,7 @@ from tomopose.errors import InputError
 from tomopose.files import plain
 from tomopose.geometry.projection import project_ball
 from tomopose.geometry.rotations import exp_rotation, log_rotation
+from tomopose.io.calibration_json import calibration_document
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
 
@@ -163,7 +164,7 @@ def test_translation_scale_is_applied_to_a_scan():
     stretched = replace(poses, T_MH=replace(poses.T_MH, t=1.001 * poses.T_MH.t))
     observed = observe(stretched, seed=None)
     cal = calibrate(SCANNER, poses, observed, free=("translation_scale",), hypotheses=False)
-    assert cal.manipulator["translation_scale"] == pytest.approx(1.001, abs=1e-9)
+    assert cal.errors.translation_scale == pytest.approx(1.001, abs=1e-9)
     x_W = cal.T_HT.apply(BALL[None])
     np.testing.assert_allclose(projection_matrices(cal, poses).project(x_W)[:, 0], observed.x_D, atol=1e-6)
 
@@ -201,7 +202,7 @@ def test_two_magnifications_are_solved_together():
     assert (u_of(together) < u_of(alone)).all()
     assert (np.abs(together.T_HT.t - MOUNT.t) < 4 * u_of(together)[3:6]).all()
     assert together.pose_id[0] == "0:0"
-    assert len(together.extra["runs"]) == 2
+    assert len(together.runs) == 2
     freed = calibrate(
         [SCANNER, far],
         [near_poses, far_poses],
@@ -227,10 +228,10 @@ def test_pose_noise_is_told_from_detection_noise():
     )
     observed = observe(replace(poses, T_MH=scattered))
     cal = calibrate(SCANNER, poses, observed, hypotheses=False)
-    noise = cal.extra["pose_noise"]
-    assert noise["translation_mm"] == pytest.approx(3e-3, rel=0.25)
-    assert noise["rotation_rad"] == pytest.approx(4e-4, rel=0.25)
-    assert noise["chi2_dof_with"] == pytest.approx(1.0, abs=0.15)
+    noise = cal.pose_noise
+    assert noise.translation_mm == pytest.approx(3e-3, rel=0.25)
+    assert noise.rotation_rad == pytest.approx(4e-4, rel=0.25)
+    assert noise.chi2_dof_with == pytest.approx(1.0, abs=0.15)
     assert cal.chi2_dof > 10
     stated = calibrate(SCANNER, poses, observed, pose_noise=(3e-3, 4e-4), hypotheses=False)
     np.testing.assert_allclose(u_of(stated), u_of(cal), rtol=0.2)
@@ -246,14 +247,14 @@ def test_a_clean_run_is_trustworthy_in_every_plan():
         cal = calibrate(SCANNER, poses, observe(poses))
         assert cal.verdict == "trustworthy", cal.reasons
         assert cal.reasons == ()
-        assert cal.extra["integrity"]["held_out_rms_px"] == pytest.approx(cal.d_rms, rel=0.4)
+        assert cal.stability.held_out_rms == pytest.approx(cal.d_rms, rel=0.4)
 
 
 def test_exact_centres_are_trustworthy():
     poses = mixed_poses()
     cal = calibrate(SCANNER, poses, observe(poses, seed=None))
     assert (cal.verdict, cal.reasons) == ("trustworthy", ())
-    json.dumps(plain({"h": cal.hypotheses, "e": cal.extra}), allow_nan=False)
+    json.dumps(plain(calibration_document(cal)), allow_nan=False)
 
 
 def test_false_alarms_are_rare():
@@ -283,9 +284,9 @@ def test_a_slipped_ball_is_found_with_its_place():
     x[80:] = after.x_D[80:]
     cal = calibrate(SCANNER, poses, replace(before, x_D=x), hypotheses=False)
     assert cal.verdict == "doubtful"
-    ball = next(e for e in cal.extra["integrity"]["effects"] if e["name"] == "ball")
-    assert ball["p"] < 1e-6
-    assert abs(poses.index_of([ball["at"]])[0] - 80) <= 3
+    ball = next(e for e in cal.stability.effects if e.name == "ball")
+    assert ball.p < 1e-6
+    assert abs(poses.index_of([ball.at])[0] - 80) <= 3
 
 
 def test_a_repeated_pose_that_moved_is_found():
@@ -293,7 +294,7 @@ def test_a_repeated_pose_that_moved_is_found():
     rows = [*range(40), 0]
     again = PoseSequence(T_MH=poses.T_MH[rows], alpha=poses.alpha[rows], pose_id=tuple(f"p{k}" for k in range(41)))
     observed = observe(again)
-    assert calibrate(SCANNER, again, observed).extra["integrity"]["repeats"][0]["again"] == "p40"
+    assert calibrate(SCANNER, again, observed).stability.repeats[0].again == "p40"
     x = observed.x_D.copy()
     x[-1] += 0.2
     cal = calibrate(SCANNER, again, replace(observed, x_D=x), robust=False, hypotheses=False)
@@ -311,10 +312,10 @@ def test_tiny_rotations_are_called_doubtful():
 @pytest.mark.parametrize("n", [6, 8, 12])
 def test_few_poses_do_not_seem_to_drift(n):
     found = [
-        e["p"]
+        e.p
         for seed in range(10)
         for e in calibrate(
             SCANNER, mixed_poses(seed, n=n), observe(mixed_poses(seed, n=n), seed=seed), hypotheses=False
-        ).extra["integrity"]["effects"]
+        ).stability.effects
     ]
     assert min(found) > 1e-4

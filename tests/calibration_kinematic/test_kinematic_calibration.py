@@ -24,6 +24,7 @@ from tomopose.calibration.solve import calibrate
 from tomopose.calibration.uncertainty.trajectory import object_points, rms_px, without_object_pose
 from tomopose.errors import InputError
 from tomopose.geometry.projection import project_ball
+from tomopose.io.calibration.errors_block import errors_document
 from tomopose.io.calibration_json import read_calibration, write_calibration
 from tomopose.manipulator.error_models import commands_for, corrected_poses
 from tomopose.manipulator.virtual import Disturbance, typical_hexapod, typical_robot
@@ -88,7 +89,7 @@ def test_a_perfect_machine_stays_rigid(kind: str) -> None:
     assert cal.model == "rigid"
     np.testing.assert_array_equal(cal.T_HT.matrix, rigid.T_HT.matrix)
     assert scan_error(cal, e).shared < 0.006
-    models = {m["model"]: m for m in cal.extra["models"]}
+    models = {m.model: m for m in cal.comparison.models}
     assert models["kinematic"]["log_evidence"] < models["rigid"]["log_evidence"] + EVIDENCE_GAIN
 
 
@@ -98,7 +99,7 @@ def test_small_errors_get_a_small_prior() -> None:
     rigid, cal = rigid_of(e), found(e)
     assert cal.model == "kinematic"
     assert scan_error(cal, e).shared < 0.5 * scan_error(rigid, e).shared
-    assert {m["model"]: m["size"] for m in cal.extra["models"]}["kinematic"] < 0.1
+    assert {m.model: m.size for m in cal.comparison.models}["kinematic"] < 0.1
 
 
 @pytest.mark.parametrize("kind", ["paper", "mixed"])
@@ -111,10 +112,10 @@ def test_backlash_and_drift_do_not_ruin_it(kind: str, worn: dict[str, float]) ->
     assert error.shared < 0.08
     assert error.shared < 2.0 * error.u_shared
     assert 0.9 < error.inside < 0.995
-    lag = cal.manipulator["lag"]
-    assert lag["names"] == [name for name in cal.tangent if name.startswith("lag_")]
-    assert not any("lag_" in name for name in cal.manipulator["names"]), "wear is told apart from the geometry"
-    assert max(cal.manipulator["scatter"]["t_mm"]) > 0.0006, "what the run drifted may come again"
+    lag = cal.errors.lag
+    assert lag.names == tuple(name for name in cal.tangent if name.startswith("lag_"))
+    assert not any("lag_" in name for name in cal.errors.names), "wear is told apart from the geometry"
+    assert max(cal.errors.scatter.t) > 0.0006, "what the run drifted may come again"
     assert any("drifted" in reason for reason in cal.reasons)
 
 
@@ -122,11 +123,11 @@ def test_leg_backlash_follows_the_scan() -> None:
     """The identified lag, applied in the order of the scan's moves, halves what is left without it."""
     e = hexapod_experiment(HEXAPOD, "mixed", 2, disturbance=Disturbance(leg_backlash_mm=0.003))
     cal = found(e)
-    without = replace(cal, manipulator={k: v for k, v in cal.manipulator.items() if k != "lag"})
+    without = replace(cal, errors=replace(cal.errors, lag=None))
     assert scan_error(cal, e).shared < 0.6 * rms_px(
         without_object_pose(projection_matrices(without, e.scan).P, e.P_true, e.points)
     )
-    back = corrected_poses(cal.manipulator, commands_for(cal.manipulator, e.scan))
+    back = corrected_poses(cal.errors, commands_for(cal.errors, e.scan))
     off = np.abs(back.T_MH.t - e.scan.T_MH.t).max(axis=1)
     assert np.mean(off > 1e-3) < 0.02, "but for poses at which a leg turns round in one table and not in the other"
     assert off.max() < 0.006
@@ -211,7 +212,7 @@ def test_matrices_of_a_robot_whose_base_is_behind_the_source() -> None:
     P.require_in_front(e.points)
     np.testing.assert_array_equal(P.select([3]).decompose().source, P.decompose().source[3:4])
     scan = e.scan.select(slice(0, 90))
-    near = projection_matrices(cal, scan, home=corrected_poses(cal.manipulator, scan).T_MH[0])
+    near = projection_matrices(cal, scan, home=corrected_poses(cal.errors, scan).T_MH[0])
     own = cal.scanner
     np.testing.assert_allclose(near.P[0], own.P_S @ own.T_WS.matrix, atol=1e-6)
     assert (near.P[:, 2, 3] > 0).all()
@@ -222,7 +223,7 @@ def test_cartesian_log_of_a_robot_gives_the_same() -> None:
     e = robot_experiment(ROBOT, 0, n=60, table=True, spin=1.0, tilt_deg=8.0)  # one branch of the wrist throughout
     cartesian = replace(e.poses, q=None)
     a, b = found(e, "kinematic"), found(e, "kinematic", poses=cartesian)
-    np.testing.assert_allclose(a.manipulator["values"], b.manipulator["values"], atol=1e-6)
+    np.testing.assert_allclose(a.errors.values, b.errors.values, atol=1e-6)
 
 
 def test_gross_errors_are_set_aside() -> None:
@@ -274,7 +275,7 @@ def test_result_survives_its_file(tmp_path: Any) -> None:
     write_calibration(tmp_path / "calibration.json", cal)
     again = read_calibration(tmp_path / "calibration.json")
     np.testing.assert_array_equal(
-        corrected_poses(again.manipulator, e.scan).T_MH.matrix, corrected_poses(cal.manipulator, e.scan).T_MH.matrix
+        corrected_poses(again.errors, e.scan).T_MH.matrix, corrected_poses(cal.errors, e.scan).T_MH.matrix
     )
     assert scan_error(again, e) == scan_error(cal, e)
 
@@ -284,20 +285,20 @@ def test_deterministic_and_independent_of_row_order() -> None:
     order = np.random.default_rng(1).permutation(len(e.observations))
     shuffled: BallObservations = e.observations.select(order)
     a, b, c = found(e), found(e), found(e, observations=shuffled)
-    assert a.manipulator == b.manipulator
-    np.testing.assert_array_equal(a.manipulator["values"], c.manipulator["values"])
+    assert errors_document(a.errors) == errors_document(b.errors)
+    np.testing.assert_array_equal(a.errors.values, c.errors.values)
 
 
 def test_residuals_by_axis_before_and_after() -> None:
     """Fig. 8 (b): tilts ten times worse than the rest, and after the correction all alike."""
     cal = found(hexapod_experiment(HEXAPOD, "paper", 0))
-    rows = {row["rotation"]: row for row in cal.extra["by_rotation"]}
+    rows = {row.rotation: row for row in cal.comparison.by_rotation}
     assert set(rows) == {"none", "+x", "-x", "+y", "-y", "+z", "-z"}
-    assert all(row["n"] == 27 for row in rows.values())
-    worst = max(row["rigid_px"] for row in rows.values())
-    assert worst > 3 * min(row["rigid_px"] for row in rows.values())
-    assert max(row["kinematic_px"] for row in rows.values()) < 0.04
-    assert rows["+x"]["rigid_um"] == pytest.approx(rows["+x"]["rigid_px"] * 200 / cal.scanner.magnification)
+    assert all(row.n == 27 for row in rows.values())
+    worst = max(row.px["rigid"] for row in rows.values())
+    assert worst > 3 * min(row.px["rigid"] for row in rows.values())
+    assert max(row.px["kinematic"] for row in rows.values()) < 0.04
+    assert rows["+x"].um["rigid"] == pytest.approx(rows["+x"].px["rigid"] * 200 / cal.scanner.magnification)
 
 
 def test_freed_scanner_parameters_are_solved_along() -> None:

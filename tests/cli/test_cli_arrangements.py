@@ -104,7 +104,7 @@ def test_moving_scanner_from_files_to_matrices(gantry, capsys):
     )
     cal = tp.read_calibration(folder / "auto" / "calibration.json")
     assert cal.model == "kinematic"
-    assert cal.manipulator["arrangement"] == "moving-scanner"
+    assert cal.arrangement == "moving-scanner"
     assert cal.provenance.arguments["arrangement"] == "moving-scanner"
     assert np.linalg.norm(cal.balls[0] - cal.balls[1]) == pytest.approx(length, abs=0.003)
     error = {}
@@ -186,7 +186,7 @@ def test_a_convention_that_is_wrong_is_found_for_a_moving_scanner_too(gantry):
     tp.write_poses(folder / "poses.csv", tp.PoseSequence.from_table(table.T_MH.t, angles, ball_id=table.ball_id))
     assert calibrate(folder, "cal", "--arrangement", "moving-scanner", "--model", "rigid") == 3
     best = tp.read_calibration(folder / "cal" / "calibration.json").hypotheses[0]
-    assert best["name"] == "sign of V"
+    assert best.name == "sign of V"
 
 
 def test_one_more_number_a_view(gantry, scanner, rng):
@@ -220,9 +220,9 @@ def test_one_more_number_a_view(gantry, scanner, rng):
     assert calibrate(folder, "links", *more[:4], "--model", "kinematic", "--d-sd-sigma-mm", "0.5") in (0, 3)
     notes = tp.read_calibration(folder / "links" / "calibration.json").observability.notes
     assert any("; use a known distance between two balls" in note for note in notes), "the links alone hold the scale"
-    views = cal.extra["view_d_SD"]
-    found, u = np.array(views["d_SD_mm"]), np.array(views["u_mm"])
-    assert views["pose_id"] == list(cal.pose_id)
+    views = cal.views
+    found, u = views.d_SD, views.u
+    assert views.pose_id == cal.pose_id
     assert np.mean(np.abs(found - d_SD) < 3 * u + 0.05) > 0.95
     assert matrices(folder, "free", "--home", "0", "--manipulator", folder / "robot.json") == 0
     with_views = tp.read_matrices(folder / "free.npz")
@@ -341,7 +341,7 @@ def test_twin_robots_from_files_to_matrices(twins, capsys):
     assert calibrate(folder, "auto", *twin_words(folder)) == 0
     cal = tp.read_calibration(folder / "auto" / "calibration.json")
     assert cal.model == "kinematic"
-    assert cal.manipulator["kind"] == "twin"
+    assert cal.arrangement == "twin"
     assert cal.provenance.arguments["arrangement"] == "twin"
     names = {p.name for p in cal.parameters}
     assert {"detector_joint_1_d", "source_joint_1_d", "base_t_x", "focus_z"} <= names

@@ -11,12 +11,16 @@ import pytest
 from tomopose import Frame, PoseSequence, RigidTransform
 from tomopose.errors import InputError, OutOfReachError, ShapeError
 from tomopose.geometry.rotations import exp_rotation, log_rotation, rotation_angle_between
+from tomopose.io.calibration.errors_block import errors_document, errors_from_document
 from tomopose.manipulator.error_models import (
+    EmpiricalErrors,
+    IdentifiedErrors,
+    PoseRange,
+    PoseScatter,
+    RigidErrors,
     commands_for,
     corrected_poses,
     correction,
-    manipulator_block,
-    model_from_block,
 )
 from tomopose.manipulator.inverse import InverseManipulator, inverse_poses
 from tomopose.manipulator.pose_map import PoseMap
@@ -43,9 +47,10 @@ def robot_poses(rng: np.random.Generator, n: int = 12) -> PoseSequence:
     return poses_from_joints(ROBOT, ROBOT.q_start + rng.uniform(-0.2, 0.2, (n, 6)))
 
 
-def block_of(machine: ErrorModel, rng: np.random.Generator, poses: PoseSequence) -> dict[str, Any]:
+def errors_of(machine: ErrorModel, rng: np.random.Generator, poses: PoseSequence) -> IdentifiedErrors | EmpiricalErrors:
     p = rng.standard_normal(len(machine.names)) * machine.sigma
-    return manipulator_block(machine, p, machine.sigma, poses)
+    of = EmpiricalErrors if isinstance(machine, PoseMap) else IdentifiedErrors
+    return of(machine=machine, values=p, u=machine.sigma, range=PoseRange.of(poses))
 
 
 def assert_exact_jacobian(machine: Any, poses: PoseSequence, p: np.ndarray) -> None:
@@ -105,9 +110,9 @@ def test_commands_reach_the_wanted_poses(which: str, rng: np.random.Generator) -
     )
     if which == "robot cartesian":
         wanted = replace(wanted, q=None)
-    block = block_of(machine, rng, wanted)
-    command = commands_for(block, wanted)
-    reached = corrected_poses(block, command)
+    errors = errors_of(machine, rng, wanted)
+    command = commands_for(errors, wanted)
+    reached = corrected_poses(errors, command)
     assert rotation_angle_between(reached.T_MH.R, wanted.T_MH.R).max() < 1e-9
     assert np.abs(reached.T_MH.t - wanted.T_MH.t).max() < 1e-6
     assert np.abs(command.T_MH.t - wanted.T_MH.t).max() > 1e-3, "without the correction it stood elsewhere"
@@ -119,15 +124,15 @@ def test_commands_out_of_reach_are_named(rng: np.random.Generator) -> None:
     legs = HEXAPOD.leg_lengths(poses.T_MH.R, poses.T_MH.t)
     limited = replace(HEXAPOD, leg_limits=(legs.min() + 1.0, legs.max() - 1.0))
     with pytest.raises(OutOfReachError, match="poses need legs"):
-        commands_for(block_of(limited, rng, poses), poses)
+        commands_for(errors_of(limited, rng, poses), poses)
 
 
 def test_correction_says_what_lies_outside(rng: np.random.Generator) -> None:
-    block = block_of(HEXAPOD, rng, hexapod_poses(rng, 40))
-    inside = correction(block, PoseSequence.from_table([[1.0, 2, 3], [0, 0, 0]], [[1.0, 0, 0], [0, -2, 1]]))
+    errors = errors_of(HEXAPOD, rng, hexapod_poses(rng, 40))
+    inside = correction(errors, PoseSequence.from_table([[1.0, 2, 3], [0, 0, 0]], [[1.0, 0, 0], [0, -2, 1]]))
     assert not inside.outside.any()
     assert inside.notes == ()
-    outside = correction(block, PoseSequence.from_table([[1.0, 2, 3], [0, 0, 0]], [[1.0, 0, 0], [0, -9, 0]]))
+    outside = correction(errors, PoseSequence.from_table([[1.0, 2, 3], [0, 0, 0]], [[1.0, 0, 0], [0, -9, 0]]))
     np.testing.assert_array_equal(outside.outside, [False, True])
     assert "1 of 2 poses lie outside the range" in outside.notes[0]
     assert outside.J.shape == (2, 6, len(HEXAPOD.names))
@@ -135,22 +140,44 @@ def test_correction_says_what_lies_outside(rng: np.random.Generator) -> None:
 
 def test_nothing_identified_changes_nothing(rng: np.random.Generator) -> None:
     poses = hexapod_poses(rng)
-    assert corrected_poses({}, poses) is poses
-    assert commands_for({}, poses) is poses
+    assert corrected_poses(RigidErrors(), poses) is poses
+    assert commands_for(RigidErrors(), poses) is poses
+
+
+def test_scale_of_trusted_poses_is_applied_and_undone(rng: np.random.Generator) -> None:
+    poses = hexapod_poses(rng)
+    errors = RigidErrors(translation_scale=1.01)
+    np.testing.assert_allclose(corrected_poses(errors, poses).T_MH.t, 1.01 * poses.T_MH.t)
+    np.testing.assert_allclose(corrected_poses(errors, commands_for(errors, poses)).T_MH.t, poses.T_MH.t)
+
+
+@pytest.mark.parametrize("which", ["hexapod", "robot", "map", "inverse"])
+def test_errors_come_back_from_their_block(which: str, rng: np.random.Generator) -> None:
+    poses = robot_poses(rng) if which == "robot" else hexapod_poses(rng)
+    machine: ErrorModel = {"hexapod": HEXAPOD, "map": PoseMap(), "inverse": InverseManipulator(machine=HEXAPOD)}.get(
+        which, ROBOT
+    )
+    errors = replace(
+        errors_of(machine, rng, poses), scatter=PoseScatter(t=rng.random(3), w=rng.random(3), about_H=True)
+    )
+    again = errors_from_document(errors_document(errors))
+    assert type(again) is type(errors)
+    assert errors_document(again) == errors_document(errors)
+    np.testing.assert_array_equal(corrected_poses(again, poses).T_MH.matrix, corrected_poses(errors, poses).T_MH.matrix)
 
 
 def test_damaged_blocks_are_refused(rng: np.random.Generator) -> None:
     poses = hexapod_poses(rng)
-    block = block_of(HEXAPOD, rng, poses)
+    block = errors_document(errors_of(HEXAPOD, rng, poses))
     for changes, message in (
         ({"kind": "crane"}, "kind 'crane'"),
-        ({"values": [0.0]}, "do not fit"),
+        ({"values": block["values"][:1] * 3, "u": block["u"][:3], "names": block["names"][:3]}, "do not fit"),
         ({"names": block["names"][::-1]}, "do not fit"),
     ):
         with pytest.raises(InputError, match=message):
-            correction({**block, **changes}, poses)
+            errors_from_document({**block, **changes})
     with pytest.raises(InputError, match="key 'nominal'"):
-        model_from_block({k: v for k, v in block.items() if k != "nominal"})
+        errors_from_document({k: v for k, v in block.items() if k != "nominal"})
     with pytest.raises(ShapeError, match="coefficients"):
         PoseMap().real_poses(poses, np.zeros(3))
     with pytest.raises(InputError, match="order 3"):
@@ -159,8 +186,8 @@ def test_damaged_blocks_are_refused(rng: np.random.Generator) -> None:
 
 def test_translation_scale_is_applied(rng: np.random.Generator) -> None:
     poses = hexapod_poses(rng)
-    block = block_of(HEXAPOD, rng, poses)
-    plain, scaled = correction(block, poses), correction({**block, "translation_scale": 1.01}, poses)
+    errors = errors_of(HEXAPOD, rng, poses)
+    plain, scaled = correction(errors, poses), correction(replace(errors, translation_scale=1.01), poses)
     np.testing.assert_allclose(scaled.poses.T_MH.t, 1.01 * plain.poses.T_MH.t)
     np.testing.assert_allclose(scaled.J[:, 3:], 1.01 * plain.J[:, 3:])
 

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from tomopose import BallObservations, Calibration, PoseSequence, ProjectionMatrices, RigidTransform, Scanner
+from tomopose.calibration.checks.convention_tests import Hypothesis
+from tomopose.calibration.checks.verdict import Finding
 from tomopose.calibration.result import Observability, Parameter
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import eq5_matrices, project_ball
@@ -34,6 +36,12 @@ def grid_poses(turns_of_table: tuple[float, ...] = (0.0,)) -> PoseSequence:
 def predicted(scanner: Scanner, T_HT: RigidTransform, poses: PoseSequence, delta: np.ndarray) -> np.ndarray:
     moved = RigidTransform(R=exp_rotation(delta[:3]) @ T_HT.R, t=T_HT.t + delta[3:6], source=Frame.H, target=Frame.T)
     return project_ball(scanner, T_HT=moved, T_MH=poses.T_MH, t=T_BALL + delta[6:], alpha=poses.alpha)
+
+
+def hypothesis(name: str, words: str, cure: str, d_rms: float, delta: float, outcome: str) -> Hypothesis:
+    return Hypothesis(
+        name=name, words=words, cure=cure, d_rms=d_rms, chi2=100.0, dof=90, delta=delta, factor=1.0, outcome=outcome
+    )
 
 
 @pytest.fixture(scope="module")
@@ -96,36 +104,16 @@ def sample() -> Callable[..., tuple[Calibration, BallObservations, PoseSequence]
                 if not s
             },
             status="optimum reached",
-            verdict=verdict,
-            reasons=("the residuals are explained by the stated detection noise", "no rival convention fits as well"),
+            checks=tuple(
+                Finding(rule=f"rule {k}", value=float(k), limit=1.0, words=words, verdict=verdict)
+                for k, words in enumerate(
+                    ("the residuals are explained by the stated detection noise", "a closing pose would help")
+                )
+            ),
             hypotheses=(
-                {
-                    "name": "declared",
-                    "words": "the data as declared",
-                    "cure": "",
-                    "d_rms_px": 0.0283,
-                    "delta_chi2": 0.0,
-                    "outcome": "declared",
-                    "verdict": "as declared",
-                },
-                {
-                    "name": "zyx",
-                    "words": "order R_z R_y R_x",
-                    "cure": "# convention: symetrie-hexapod",
-                    "d_rms_px": 0.0283,
-                    "delta_chi2": 0.4,
-                    "outcome": "same",
-                    "verdict": "cannot be told apart with these poses",
-                },
-                {
-                    "name": "rows",
-                    "words": "image rows flipped",
-                    "cure": "image_rows: bottom-first",
-                    "d_rms_px": 4.61,
-                    "delta_chi2": 9.1e6,
-                    "outcome": "worse",
-                    "verdict": "excluded",
-                },
+                hypothesis("declared", "the data as declared", "", 0.0283, 0.0, "declared"),
+                hypothesis("zyx", "order R_z R_y R_x", "# convention: symetrie-hexapod", 0.0283, 0.4, "same"),
+                hypothesis("rows", "image rows flipped", "image_rows: bottom-first", 4.61, 9.1e6, "worse"),
             ),
             pivot=np.array([0.0, 0.0, 200.0]),
             provenance=provenance(arguments={"model": "rigid"}, seed=20231028),

@@ -11,6 +11,7 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 
+from tomopose.calibration.result import ModelComparison, ModelJudgement
 from tomopose.errors import FileError, ShapeError
 from tomopose.report import calibration_report, matrices_report, observations_report, write_report
 from tomopose.report.page import Page, Section, Table, plotly_script, render, script_json
@@ -83,11 +84,14 @@ def test_every_figure_says_what_it_means_and_what_to_look_for(full):
 
 
 def test_the_verdict_comes_first_with_its_reasons(full, sample):
-    calibration, _, _ = sample()
     verdict = full.index('class="verdict good"')
-    assert verdict < full.index("<section")
+    assert verdict < full.index("none of the checks gave a reason for doubt") < full.index("<section")
+    calibration, observations, poses = sample(verdict="doubtful")
+    html = calibration_report(calibration, observations=observations, poses=poses)
+    verdict = html.index('class="verdict care"')
+    assert len(calibration.reasons) == 2
     for reason in calibration.reasons:
-        assert verdict < full.index(reason) < full.index("<section")
+        assert verdict < html.index(reason) < html.index("<section")
 
 
 @pytest.mark.parametrize(("verdict", "tone"), [("doubtful", "care"), ("rejected", "bad")])
@@ -112,7 +116,7 @@ def test_numbers_in_the_page_are_those_of_the_calibration(full, sample):
 
 def test_a_bare_calibration_says_what_was_not_given(sample):
     calibration, _, _ = sample(turns=(0.0,))
-    bare = dataclasses.replace(calibration, provenance=None, hypotheses=(), pivot=None, outliers={}, reasons=())
+    bare = dataclasses.replace(calibration, provenance=None, hypotheses=(), pivot=None, outliers={}, checks=())
     html = calibration_report(bare, observations=None, poses=None)
     for words in (
         "Provenance: not given",
@@ -142,7 +146,7 @@ def test_parameters_without_uncertainty_are_not_determinable(sample):
 
 def test_images_without_a_ball_stand_beside_the_outliers(sample):
     calibration, observations, poses = sample()
-    seen = dataclasses.replace(calibration, extra={"not_seen": {"p999": "no ball found"}})
+    seen = dataclasses.replace(calibration, not_seen={"p999": "no ball found"})
     html = calibration_report(seen, observations=observations, poses=poses)
     assert "<td>p999</td><td>no ball found</td>" in html
     assert f"{len(calibration.outliers) + 1} set aside" in html
@@ -190,17 +194,30 @@ def test_the_same_values_give_the_same_page(sample):
     assert calibration_report(calibration, observations=observations, poses=poses) == first
 
 
-def test_extra_results_become_tables(sample):
-    calibration, observations, poses = sample()
-    extra = {
-        "models": [{"model": "rigid", "d_rms_px": 0.495}, {"model": "kinematic", "d_rms_px": 0.031}],
-        "cross_validation": {"folds": 5, "held_out_px": 0.0321},
-        "not_seen": {},
-    }
-    html = calibration_report(dataclasses.replace(calibration, extra=extra), observations=observations, poses=poses)
+def test_models_stability_and_findings_become_tables(sample):
+    calibration, observations, poses = sample(verdict="doubtful")
+    rigid = ModelJudgement(
+        model="rigid",
+        log_evidence=1.0,
+        log_predictive=2.0,
+        cv_rms=0.0321,
+        cv_chi2=1.1,
+        d_rms=0.495,
+        chi2_dof=1.0,
+        scatter=1.0,
+        size=1.0,
+    )
+    models = (rigid, dataclasses.replace(rigid, model="kinematic", d_rms=0.031))
+    html = calibration_report(
+        dataclasses.replace(calibration, comparison=ModelComparison(models=models, chosen="kinematic")),
+        observations=observations,
+        poses=poses,
+    )
     assert "Models and checks" in html
     assert "kinematic" in html
     assert "0.0321" in html
+    assert "What the checks found" in html
+    assert "a closing pose would help" in html
 
 
 def test_observations_report_counts_and_names_what_is_lost(sample):

@@ -12,7 +12,7 @@ import tomopose as tp
 from tomopose.calibration.uncertainty.propagation import length_sigma
 from tomopose.errors import InputError
 from tomopose.geometry.projection import project_ball
-from tomopose.manipulator.error_models import manipulator_block
+from tomopose.manipulator.error_models import EmpiricalErrors, PoseRange, RigidErrors
 from tomopose.manipulator.pose_map import PoseMap
 from tomopose.measurement.alignment import Alignment
 from tomopose.measurement.features.fits import fit_plane, fit_sphere
@@ -146,15 +146,19 @@ def test_virtual_scans_with_drawn_calibrations_scatter_as_the_covariance_says(ru
     assert found["SD"].runs == draws
 
 
+def map_errors(run, machine, values):
+    return EmpiricalErrors(machine=machine, values=values, u=machine.sigma, range=PoseRange.of(run.poses))
+
+
 @pytest.fixture(scope="module")
 def kinematic(run, calibration):
     """The same with errors of a manipulator, a linear map, as well known as before it was calibrated."""
     machine = PoseMap(order=1, t_scale=1.0)
-    block = manipulator_block(machine, np.zeros(len(machine.names)), machine.sigma, run.poses)
+    errors = map_errors(run, machine, np.zeros(len(machine.names)))
     return replace(
         calibration,
         model="kinematic",
-        manipulator=block,
+        errors=errors,
         tangent=(*calibration.tangent, *machine.names),
         covariance=block_diag(calibration.covariance, np.diag(machine.sigma**2)),
     )
@@ -167,7 +171,9 @@ def test_drawn_errors_of_a_manipulator_scatter_as_their_covariance_says(run, kin
     rigid, stated = (
         calibration_shares(results(features), plan(), "scan", c, run.poses)["SD"]
         for c in (
-            replace(kinematic, manipulator={}, tangent=kinematic.tangent[:6], covariance=kinematic.covariance[:6, :6]),
+            replace(
+                kinematic, errors=RigidErrors(), tangent=kinematic.tangent[:6], covariance=kinematic.covariance[:6, :6]
+            ),
             kinematic,
         )
     )
@@ -195,7 +201,7 @@ def test_a_scene_whose_manipulator_errs_is_believed_to_stand_where_the_calibrati
     exact = replace(
         kinematic,
         covariance=1e-12 * np.eye(len(kinematic.tangent)),
-        manipulator=manipulator_block(machine, errors, machine.sigma, run.poses),
+        errors=map_errors(run, machine, errors),
     )
     real = machine.real_poses(run.poses, errors)
     errs = replace(run, T_MH=replace(run.T_MH, R=real.R, t=real.t))

@@ -15,6 +15,7 @@ from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
 from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.error_models import RigidErrors, corrected_poses
 from tomopose.manipulator.poses import PIVOT_TOLERANCE_MM, PoseSequence
 from tomopose.units import Array
 
@@ -57,7 +58,7 @@ def _point_sigma(
     the object; it is removed there.
     """
     R_HT, t_HT = calibration.T_HT.R, calibration.T_HT.t
-    if "kind" in calibration.manipulator:
+    if not isinstance(calibration.errors, RigidErrors):
         x_W = calibration.scanner.T_TW(0.0).apply(x_M @ R_HT.T + t_HT)
         shared = np.sqrt(np.mean(trajectory_sigma(calibration, commanded, x_W, scatter=False) ** 2, axis=2))
     else:
@@ -105,13 +106,7 @@ def projection_matrices(
     if scanner is not None:
         require_same_scanner(calibration, scanner)
     commanded = poses
-    scale = float(calibration.manipulator.get("translation_scale", 1.0))
-    if calibration.model != "rigid" or "kind" in calibration.manipulator:
-        from tomopose.manipulator.error_models import corrected_poses
-
-        poses = corrected_poses(calibration.manipulator, poses)
-    elif scale != 1.0:
-        poses = replace(poses, T_MH=replace(poses.T_MH, t=scale * poses.T_MH.t))
+    poses = corrected_poses(calibration.errors, poses)
     own = calibration.scanner
     alpha = np.zeros(len(poses)) if poses.alpha is None else poses.alpha
     T_0 = RigidTransform.identity(Frame.M, Frame.H) if home is None else home.require(Frame.M, Frame.H)

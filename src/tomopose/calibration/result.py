@@ -1,21 +1,28 @@
-"""What a calibration is: one immutable value with a status in a human sentence."""
+"""What a calibration is: one immutable value, whatever the model and the arrangement, with its findings and verdict."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
+from tomopose.calibration.checks.convention_tests import Hypothesis
+from tomopose.calibration.checks.stability import Stability
+from tomopose.calibration.checks.verdict import Finding, Verdict, judge
+from tomopose.calibration.rigid.observability import Observability
 from tomopose.errors import ShapeError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.error_models import Errors, RigidErrors
 from tomopose.provenance import Provenance
 from tomopose.units import Array, float_array
 
-VERDICTS = ("trustworthy", "doubtful", "rejected")
+Arrangement: TypeAlias = Literal["moving-object", "moving-scanner", "twin"]
+ARRANGEMENTS: tuple[Arrangement, ...] = get_args(Arrangement)
+Source: TypeAlias = Literal["scanner.json", "default", "exact"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,18 +36,78 @@ class Parameter:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Observability:
-    """What the poses can tell.  singular_values of the scaled Jacobian, largest first; unobservable: directions, in
-    words; notes: what would cure them."""
+class Assumed:
+    """A parameter that was taken with a standard uncertainty rather than measured, and who said so.
 
-    singular_values: Array
-    unobservable: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    source: "scanner.json" (the user's number), "default" (nobody stated any), "exact" (the user's 0).
+    """
 
-    @property
-    def condition(self) -> float:
-        s = np.asarray(self.singular_values)
-        return float(s[0] / s[-1]) if s.size and s[-1] > 0 else float("inf")
+    name: str
+    sigma: float
+    unit: str
+    source: Source
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseNoiseFound:
+    """PoseScatter of the poses beside detection noise, a coordinate each: translation mm, rotation rad; gain: how much
+    -2 log L falls by it; chi2/dof with it and without."""
+
+    translation_mm: float
+    rotation_rad: float
+    gain: float
+    chi2_dof_with: float
+    chi2_dof_without: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelJudgement:
+    """How one model of the manipulator did.
+
+    log_evidence: at its optimum.  log_predictive: of the held-out centres.  cv_rms: px, rms distance of the held-out
+    centres from their predictions.  cv_chi2: mean square of the held-out misses in predicted standard deviations,
+    1 where the model holds all there is.  d_rms: of the fit itself, px.  scatter: factor on the variance of the
+    stated repeatability.  size: factor on the stated sizes of the errors.
+    """
+
+    model: str
+    log_evidence: float
+    log_predictive: float
+    cv_rms: float
+    cv_chi2: float
+    d_rms: float
+    chi2_dof: float
+    scatter: float
+    size: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class RotationResiduals:
+    """Residuals of n poses turned about one axis: model -> rms distance in px, and in um at the object."""
+
+    rotation: str
+    n: int
+    px: Mapping[str, float]
+    um: Mapping[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelComparison:
+    """The models side by side, and the residuals of the first and the chosen one by axis of rotation."""
+
+    models: tuple[ModelJudgement, ...]
+    chosen: str
+    by_rotation: tuple[RotationResiduals, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewDistances:
+    """d_SD of every view, (n,) mm, with its standard uncertainty u (n,), where it scatters by `sigma` mm a view."""
+
+    sigma: float
+    pose_id: tuple[str, ...]
+    d_SD: Array
+    u: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,13 +122,20 @@ class Calibration:
                   several balls t[ID]_x), then freed scanner and manipulator parameters by name.
     covariance:   (m, m), in the units of `tangent`.
     pose_id, x_D, residuals:  of the poses used: names, observed centres (n, 2), observed minus calculated (n, 2), px.
-    outliers:     pose ids set aside, with the reason.
+    outliers:     pose ids set aside, with the reason;  not_seen: pose ids without a measured ball, with the reason.
     chi2, dof:    of the weighted fit; dof = equations - parameters (+ priors).
-    model:        rigid | kinematic | slack.
-    manipulator:  identified errors as named numbers, or empty.
+    model:        rigid | kinematic | slack.   arrangement: what moves.
+    errors:       the manipulator's: RigidErrors, IdentifiedErrors, EmpiricalErrors or TwinErrors.
+    priors:       freed parameter -> prior standard deviation; inf where it had none.
+    assumed:      what was taken with a standard uncertainty rather than measured.
     status:       a sentence; converged: whether an optimum was reached.
-    verdict, reasons: trustworthy | doubtful | rejected, and why.
-    hypotheses:   rival conventions tried, ranked (dicts ready for JSON).
+    checks:       the findings; `verdict` and `reasons` follow from them and from nothing else.
+    hypotheses:   alternative conventions tried, ranked.
+    stability, comparison, pose_noise, views: what else was found, None where it was not looked for.
+    widening:     factor on the covariance by the rule of `covariance.widening`.
+    expected_residual: px, the d_rms that the covariances in use explain; NaN where not calculated.
+    magnification_at_ball: mean over the poses of d_SD over the ball's distance from the source; None: not known.
+    runs:         the scanner of each run where several were solved together.
     """
 
     scanner: Scanner
@@ -77,16 +151,26 @@ class Calibration:
     parameters: tuple[Parameter, ...]
     observability: Observability
     outliers: Mapping[str, str] = field(default_factory=dict)
+    not_seen: Mapping[str, str] = field(default_factory=dict)
     model: str = "rigid"
-    manipulator: Mapping[str, Any] = field(default_factory=dict)
+    arrangement: Arrangement = "moving-object"
+    errors: Errors = field(default_factory=RigidErrors)
+    priors: Mapping[str, float] = field(default_factory=dict)
+    assumed: tuple[Assumed, ...] = ()
     converged: bool = True
     status: str = ""
-    verdict: str = "trustworthy"
-    reasons: tuple[str, ...] = ()
-    hypotheses: tuple[Mapping[str, Any], ...] = ()
+    checks: tuple[Finding, ...] = ()
+    hypotheses: tuple[Hypothesis, ...] = ()
+    stability: Stability | None = None
+    comparison: ModelComparison | None = None
+    pose_noise: PoseNoiseFound | None = None
+    views: ViewDistances | None = None
+    widening: float = 1.0
+    expected_residual: float = float("nan")
+    magnification_at_ball: float | None = None
+    runs: tuple[Scanner, ...] = ()
     pivot: Array | None = None
     convention: str = "pi-hexapod"
-    extra: Mapping[str, Any] = field(default_factory=dict)
     provenance: Provenance | None = None
 
     def __post_init__(self) -> None:
@@ -94,13 +178,28 @@ class Calibration:
         m = len(self.tangent)
         if np.shape(self.covariance) != (m, m):
             raise ShapeError(f"covariance is {np.shape(self.covariance)} but {m} coordinates are named")
-        if self.verdict not in VERDICTS:
-            raise ShapeError(f"verdict {self.verdict!r} is none of {', '.join(VERDICTS)}")
+        if self.arrangement not in ARRANGEMENTS:
+            raise ShapeError(f"arrangement {self.arrangement!r} is none of {', '.join(ARRANGEMENTS)}")
         object.__setattr__(self, "balls", {int(k): float_array(v) for k, v in self.balls.items()})
         for name in ("covariance", "x_D", "residuals"):
             object.__setattr__(self, name, float_array(getattr(self, name)))
         if self.pivot is not None:
             object.__setattr__(self, "pivot", float_array(self.pivot))
+
+    @property
+    def verdict(self) -> Verdict:
+        """trustworthy | doubtful | rejected: the worst of the findings."""
+        return judge(self.checks)[0]
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """The words of the findings that give doubt, worst first."""
+        return judge(self.checks)[1]
+
+    @property
+    def inverse(self) -> bool:
+        """Whether source and detector move, so that pose tables enter inverted."""
+        return self.arrangement != "moving-object"
 
     @property
     def t(self) -> Array:
@@ -119,9 +218,10 @@ class Calibration:
 
     @property
     def d_rms_um(self) -> float:
-        """d_rms at the object, um: pixels times the mean pitch over the magnification."""
+        """d_rms at the ball, um: pixels times the mean pitch over the magnification there."""
         pitch = np.sqrt(self.scanner.p_u * self.scanner.p_v)
-        return float(self.d_rms * pitch / self.scanner.magnification * 1000.0)
+        at_ball = self.scanner.magnification if self.magnification_at_ball is None else self.magnification_at_ball
+        return float(self.d_rms * pitch / at_ball * 1000.0)
 
     @property
     def chi2_dof(self) -> float:

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from tomopose.calibration.build import Fitted, build, expected_px, magnification_at_balls
 from tomopose.calibration.checks.convention_tests import Diagnosis, ranked, set_pose_rival
 from tomopose.calibration.checks.conventions import RIVALS, Rival
-from tomopose.calibration.checks.stability import Integrity, integrity
-from tomopose.calibration.checks.verdict import Findings, verdict
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS
-from tomopose.calibration.model.covariance import angles_by_tangent, widening
+from tomopose.calibration.model.covariance import widening
 from tomopose.calibration.model.parameters import (
     UNITS,
     FreeParameters,
@@ -21,43 +20,21 @@ from tomopose.calibration.model.parameters import (
     base_name,
     free_parameters,
     translation_scale,
-    unit_of,
 )
 from tomopose.calibration.model.problem import pair
-from tomopose.calibration.result import Calibration, Parameter
+from tomopose.calibration.result import Arrangement, Calibration, PoseNoiseFound
 from tomopose.calibration.rigid.estimate import Solution, solve, with_pose_noise
-from tomopose.calibration.rigid.fit import blocks, tangent_names
+from tomopose.calibration.rigid.fit import blocks, linear_fit
 from tomopose.calibration.rigid.observability import observability
-from tomopose.calibration.uncertainty.propagation import tilt_sigma
 from tomopose.errors import InputError, NotConvergedError
-from tomopose.geometry.rotations import angles_from_rotation
-from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
+from tomopose.geometry.scanner import Scanner
+from tomopose.manipulator.error_models import PoseScatter, RigidErrors
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.provenance import provenance
 from tomopose.units import Array
 
 MODELS = ("auto", "rigid", "kinematic", "slack")
-
-
-def parameter_list(solution: Solution) -> tuple[Parameter, ...]:
-    """The estimated numbers with their standard uncertainties: angles of T_HT, t_HT, the balls, freed parameters."""
-    fit, C, free = solution.fit, solution.covariance, solution.free
-    E = angles_by_tangent(fit.R_HT)
-    u_angles = np.sqrt(np.einsum("ij,jk,ik->i", E, C[:3, :3], E))
-    u = np.sqrt(np.maximum(np.diag(C), 0.0))
-    names = tangent_names(solution.problem.ball_ids, free)
-    result = [
-        Parameter(name=f"phi_HT_{c}", value=float(a), u=float(s), unit="rad")
-        for c, a, s in zip("xyz", angles_from_rotation(fit.R_HT), u_angles, strict=True)
-    ]
-    values = np.concatenate([fit.t_HT, fit.t.ravel(), free.value + fit.delta])
-    units = ["mm"] * (3 + fit.t.size) + [unit_of(n) for n in free.names]
-    result += [
-        Parameter(name=n, value=float(v), u=float(s), unit=unit)
-        for n, v, s, unit in zip(names[3:], values, u[3:], units, strict=True)
-    ]
-    return tuple(result)
 
 
 def assumed_names(free: FreeParameters) -> tuple[str, ...]:
@@ -84,100 +61,69 @@ def _stated_chi2(solution: Solution, stated: Solution) -> float:
     return float(((W @ r[:, :, None]) ** 2).sum()) + prior
 
 
-def _outliers(solution: Solution) -> dict[str, str]:
-    robust = solution.robust
-    return {
-        i: f"{d:.1f} standard deviations away, beyond what a clean run allows"
-        for i, d, k in zip(solution.problem.pose_id, np.sqrt(robust.distance2), robust.keep, strict=True)
-        if not k
-    }
-
-
-def _extra(solution: Solution, checks: Integrity, chi2_dof: float) -> dict[str, Any]:
-    """What the report shows besides, ready for JSON."""
-    p = solution.problem
-    extra: dict[str, Any] = {
-        "integrity": checks.to_json(),
-        "widening": widening(solution.chi2, solution.dof),
-        "expected_residual_px": _expected_px(solution),
-    }
-    if solution.noise is not None:
-        extra["pose_noise"] = {
-            "translation_mm": solution.noise.translation,
-            "rotation_rad": solution.noise.rotation,
-            "gain": solution.noise.gain,
-            "chi2_dof_with": solution.chi2 / solution.dof,
-            "chi2_dof_without": chi2_dof,
-        }
-    if p.not_seen:
-        extra["not_seen"] = dict(p.not_seen)
-    if len(p.scanners) > 1:
-        extra["runs"] = [
-            {name: getattr(s, name) for name in PARAMETER_UNITS}
-            for s in adjusted_scanners(p.scanners, solution.free, solution.fit.delta)
-        ]
-    return extra
-
-
-def _expected_px(solution: Solution) -> float:
-    """d_rms that the covariances in use explain, px, after the fit has used up its parameters."""
-    n, m = len(solution.used), solution.J.shape[2]
-    total = float(np.trace(solution.used.covariance, axis1=1, axis2=2).mean())
-    return float(np.sqrt(total * max(1.0 - m / (2 * n), 0.0)))
-
-
-def _calibration(
-    solution: Solution, stated: Solution, diagnosis: Diagnosis | None, arguments: Mapping[str, Any]
+def _rigid(
+    solution: Solution,
+    stated: Solution,
+    diagnosis: Diagnosis | None,
+    arrangement: Arrangement,
+    arguments: Mapping[str, Any],
 ) -> Calibration:
     p, fit, free = solution.used, solution.fit, solution.free
-    scanners = adjusted_scanners(p.scanners, free, fit.delta)
     assumed = assumed_names(free)
-    scale = translation_scale(free, fit.delta)
-    checks = integrity(p, free, fit)
     chi2 = _stated_chi2(solution, stated)
-    result = Calibration(
-        scanner=scanners[0],
-        T_HT=fit.T_HT,
-        balls=dict(zip(p.ball_ids, fit.t, strict=True)),
-        tangent=tangent_names(p.ball_ids, free),
-        covariance=solution.covariance,
-        pose_id=p.pose_id,
-        x_D=p.x_D,
-        residuals=p.x_D - solution.x_calc,
-        chi2=chi2,
-        dof=solution.dof,
-        parameters=parameter_list(solution),
-        observability=observability(p, free, solution.J, assumed_jacobian(solution, assumed), assumed),
-        outliers=_outliers(solution),
-        manipulator={"translation_scale": scale} if scale != 1.0 else {},
-        converged=fit.converged,
-        status=(
-            f"optimum of {len(p)} poses reached"
-            if fit.converged
-            else "the iteration ended before it reached an optimum"
-        ),
-        hypotheses=tuple(h.to_json() for h in diagnosis.hypotheses) if diagnosis else (),
-        pivot=p.pivot,
-        convention=p.convention,
-        extra=_extra(solution, checks, chi2 / solution.dof),
-        provenance=provenance(arguments=arguments),
-    )
-    word, reasons = verdict(
-        Findings(
-            converged=result.converged,
-            dof=result.dof,
-            n_used=len(p),
-            n_outliers=len(result.outliers),
+    noise, scatter = None, None
+    if solution.noise is not None:
+        scatter = PoseScatter(t=np.full(3, solution.noise.translation), w=np.full(3, solution.noise.rotation))
+        noise = PoseNoiseFound(
+            translation_mm=solution.noise.translation,
+            rotation_rad=solution.noise.rotation,
+            gain=solution.noise.gain,
+            chi2_dof_with=solution.chi2 / solution.dof,
+            chi2_dof_without=chi2 / solution.dof,
+        )
+    linear = linear_fit(p, free, fit)
+    scanners = adjusted_scanners(p.scanners, free, fit.delta)
+    scale = translation_scale(free, fit.delta)
+    return build(
+        Fitted(
+            everything=solution.problem,
+            keep=solution.robust.keep,
+            distance2=solution.robust.distance2,
+            linear=linear,
+            T_HT=fit.T_HT,
+            balls=fit.t,
+            free=free,
+            delta=fit.delta,
+            p=np.zeros(0),
+            p_names=(),
+            p_units=(),
+            covariance=solution.covariance,
+            widening=widening(solution.chi2, solution.dof),
+            widens=True,
+            chi2=chi2,
+            fit_chi2=solution.chi2,
+            dof=solution.dof,
+            converged=fit.converged,
+            status=(
+                f"optimum of {len(p)} poses reached"
+                if fit.converged
+                else "the iteration ended before it reached an optimum"
+            ),
             misfit=stated.robust.misfit,
-            chi2_dof=result.chi2_dof,
-            residual_px=result.d_rms,
-            expected_px=_expected_px(stated),
-            scan_px=tilt_sigma(result),
+            expected_px=expected_px(linear),
+            stated_px=expected_px(linear_fit(stated.used, free, stated.fit)),
+            model="rigid",
+            arrangement=arrangement,
+            errors=RigidErrors(translation_scale=scale, scatter=scatter),
+            observability=observability(p, free, solution.J, assumed_jacobian(solution, assumed), assumed),
             diagnosis=diagnosis,
-            integrity=checks,
+            pose_noise=noise,
+            magnification_at_ball=magnification_at_balls(
+                replace(p, t_MH=scale * p.t_MH), scanners, fit.T_HT, fit.t[p.ball]
+            ),
+            provenance=provenance(arguments=arguments),
         )
     )
-    return replace(result, verdict=word, reasons=reasons)
 
 
 def calibrate(
@@ -229,28 +175,25 @@ def calibrate(
         raise InputError("model 'kinematic' needs the manipulator's nominal geometry (--manipulator FILE)")
     if distances and (model == "rigid" or (model == "auto" and manipulator is None)):
         raise InputError("distances between balls serve models with the manipulator's errors; give its geometry")
-    problem = pair(scanner, poses, observations)
-    freed = free_parameters(problem.scanners, free=free, fix=fix, priors=priors)
-    stated = solve(problem, freed, robust=robust)
-    solution = with_pose_noise(stated, pose_noise, robust=robust)
-    diagnosis = None
-    if hypotheses:
-        other = set_pose_rival(problem, poses)
-        known = RIVALS if isinstance(hypotheses, bool) else hypotheses
-        quick = [r for r in (*known, *([other] if other else [])) if r.quick]
-        diagnosis = ranked(stated.used, freed, stated.fit, quick, starts=0)
-    arguments = {
-        "model": model,
-        "free": list(free),
-        "fix": list(fix),
-        "priors": dict(priors or {}),
-        "robust": robust,
-        "pose_noise": pose_noise if pose_noise is None or isinstance(pose_noise, str) else list(pose_noise),
-    }
-    rigid = _calibration(solution, stated, diagnosis, arguments)
-    if not rigid.converged and raise_on_failure:
-        raise NotConvergedError(rigid.status, calibration=rigid)
+    rigid, freed = rigid_calibration(
+        scanner,
+        poses,
+        observations,
+        free=free,
+        fix=fix,
+        priors=priors,
+        robust=robust,
+        hypotheses=hypotheses,
+        pose_noise=pose_noise,
+        raise_on_failure=raise_on_failure,
+    )
+    if rigid.provenance is not None:
+        arguments = {"model": model, **rigid.provenance.arguments}
+        rigid = replace(rigid, provenance=replace(rigid.provenance, arguments=arguments))
     if model == "rigid" or (model == "auto" and manipulator is None):
+        return rigid
+    if rigid.verdict == "rejected":
+        # a manipulator's errors, fitted to a wrong reading of the data, explain anything
         return rigid
     from tomopose.calibration.identified.calibrate import calibrate_kinematic
 
@@ -265,3 +208,41 @@ def calibrate(
         distances=distances,
         robust=robust,
     )
+
+
+def rigid_calibration(
+    scanner: Scanner | Sequence[Scanner],
+    poses: PoseSequence | Sequence[PoseSequence],
+    observations: BallObservations | Sequence[BallObservations],
+    *,
+    free: Sequence[str] = (),
+    fix: Sequence[str] = (),
+    priors: Mapping[str, float] | None = None,
+    robust: bool = True,
+    hypotheses: bool | Sequence[Rival] = True,
+    pose_noise: str | tuple[float, float] | None = "auto",
+    raise_on_failure: bool = True,
+    arrangement: Arrangement = "moving-object",
+) -> tuple[Calibration, FreeParameters]:
+    """The calibration that trusts the poses, and what was freed; arguments as of `calibrate`."""
+    problem = pair(scanner, poses, observations)
+    freed = free_parameters(problem.scanners, free=free, fix=fix, priors=priors)
+    stated = solve(problem, freed, robust=robust)
+    solution = with_pose_noise(stated, pose_noise, robust=robust)
+    diagnosis = None
+    if hypotheses:
+        other = set_pose_rival(problem, poses)
+        known = RIVALS if isinstance(hypotheses, bool) else hypotheses
+        quick = [r for r in (*known, *([other] if other else [])) if r.quick]
+        diagnosis = ranked(stated.used, freed, stated.fit, quick, starts=0)
+    arguments = {
+        "free": list(free),
+        "fix": list(fix),
+        "priors": dict(priors or {}),
+        "robust": robust,
+        "pose_noise": pose_noise if pose_noise is None or isinstance(pose_noise, str) else list(pose_noise),
+    }
+    found = _rigid(solution, stated, diagnosis, arrangement, arguments)
+    if not found.converged and raise_on_failure:
+        raise NotConvergedError(found.status, calibration=found)
+    return found, freed

@@ -187,8 +187,10 @@ def calibrate(options: Options) -> int:
     Exit code 3 says that the calibration finished but is not trustworthy; the report leads with the reasons.
     """
     import tomopose as tp
-    from tomopose.calibration.checks.ball_size import require_ball_size, size_ratio
+    from tomopose.calibration.build import with_findings
+    from tomopose.calibration.checks.ball_size import ball_size_findings
     from tomopose.cli.job import calibration_summary, exit_code, require_free_folder, write_calibration_folder
+    from tomopose.manipulator.error_models import RigidErrors
     from tomopose.provenance import provenance
 
     o = options
@@ -201,9 +203,7 @@ def calibrate(options: Options) -> int:
     # Where the scanner moves, the chain runs through the inverse poses.
     shown = tp.inverse_poses(given.poses) if o.moving_scanner or given.twin is not None else given.poses
     if given.images is not None and given.twin is None and result.verdict != "rejected":
-        size = require_ball_size(size_ratio(result, shown, given.observations, o.ball_diameter), o.ball_diameter)
-        if size:
-            o.say.note(f"note: {size}")
+        result = with_findings(result, ball_size_findings(result, shown, given.observations, o.ball_diameter))
     made = provenance(
         inputs=[p for p in (o.scanner, o.poses, o.observations, o.manipulator, o.twin, o.source_poses) if p],
         arguments=arguments(
@@ -220,7 +220,7 @@ def calibrate(options: Options) -> int:
     result = replace(result, provenance=made)
     write_calibration_folder(o.out, result, given.observations, shown, images=given.images, force=o.force)
     summary, lines = calibration_summary(result)
-    if "kind" in result.manipulator:
+    if not isinstance(result.errors, RigidErrors):
         lines += [f"  {note}" for note in result.observability.notes]
     o.say.result({"out": o.out.name, **summary}, [*lines, f"{o.out}: calibration.json, observations.csv, report.html"])
     return exit_code(result)

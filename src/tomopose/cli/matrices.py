@@ -60,7 +60,7 @@ def require_tables(o: Options, cal: Calibration) -> None:
     from tomopose.errors import InputError
 
     path = o.calibration
-    twins = cal.manipulator.get("kind") == "twin"
+    twins = cal.arrangement == "twin"
     if twins and o.source_poses is None:
         raise InputError(f"{path} is of twin robots; --source-poses with the source robot's table is missing")
     if not twins and o.source_poses is not None:
@@ -80,7 +80,7 @@ def machines(o: Options, cal: Calibration) -> tuple[Any, Any]:
     from tomopose.manipulator.twin_file import read_twin
 
     if o.manipulator is None:
-        return machines_of(cal.manipulator)
+        return machines_of(cal.errors)
     if o.source_poses is None:
         return tp.read_manipulator(o.manipulator), None
     drawn = read_twin(o.manipulator)
@@ -94,7 +94,7 @@ def matrices_of(
     import tomopose as tp
     from tomopose.calibration.arrangements.twin_robots import twin_notes
     from tomopose.cli.job import forward_of
-    from tomopose.manipulator.error_models import correction, moving_scanner
+    from tomopose.manipulator.error_models import correction
 
     scan = tp.read_poses(o.poses, forward=forward_of(machine))
     scanner = None if o.scanner is None else tp.read_scanner(o.scanner)
@@ -102,12 +102,12 @@ def matrices_of(
         source = tp.read_poses(o.source_poses, forward=forward_of(other))
         twins = tp.twin_matrices(cal, scan, source, binning=o.binning, scanner=scanner)
         return twins, tuple(twin_notes(cal, scan, source)), None
-    moving = moving_scanner(cal.manipulator)
+    moving = cal.inverse
     scan = tp.inverse_poses(scan) if moving else scan
-    real = correction(cal.manipulator, scan)
+    real = correction(cal.errors, scan)
     at_home = None if o.home is None else real.poses.T_MH[int(real.poses.index_of([o.home])[0])]
     result = tp.projection_matrices(cal, scan, home=at_home, binning=o.binning, scanner=scanner)
-    wanted = None if o.commands is None else tp.commands_for(cal.manipulator, scan)
+    wanted = None if o.commands is None else tp.commands_for(cal.errors, scan)
     if wanted is not None and moving:
         wanted = tp.inverse_poses(wanted)
     return result, tuple(real.notes), wanted

@@ -1,4 +1,7 @@
-"""calibration.json: a calibration with everything that is needed to use it, to judge it, and to load it unchanged."""
+"""calibration.json: a calibration with everything that is needed to use it, to judge it, and to load it unchanged.
+
+Schema 2 is written; schema 1 is read for ever (`calibration.version_1` translates it).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.result import Calibration, Observability, Parameter
+from tomopose.calibration.result import Assumed, Calibration, Observability, Parameter
 from tomopose.coverage import expanded_k2
 from tomopose.errors import FileError, InputError
 from tomopose.files import read_json, require_absent, write_json
@@ -16,28 +19,31 @@ from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import rotation_angle_between, rotation_from_angles
 from tomopose.geometry.scanner import PARAMETER_UNITS
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.io.calibration import checks_blocks
+from tomopose.io.calibration.errors_block import errors_document, errors_from_document
+from tomopose.io.calibration.version_1 import as_version_2
 from tomopose.io.numbers_json import decode_array, encode
 from tomopose.io.scanner_json import scanner_document, scanner_from_document
 from tomopose.provenance import Provenance
 
+VERSION = 2
 ANGLES_TOLERANCE = 1e-9
 
 
 def write_calibration(path: str | Path, cal: Calibration, *, force: bool = False) -> None:
     """Write calibration.json; `read_calibration` gives back every number bit for bit.
 
-    `manipulator`, `hypotheses` and `extra` hold what JSON knows: text, numbers, lists, objects; in them numbers that
-    are not finite become null.  FileError if the file exists and `force` is not given.
+    FileError if the file exists and `force` is not given.
     """
-    write_json(require_absent(path, force=force), "calibration", calibration_document(cal))
+    write_json(require_absent(path, force=force), "calibration", calibration_document(cal), version=VERSION)
 
 
 def calibration_document(cal: Calibration) -> dict[str, Any]:
     """The JSON object of a calibration, without its schema."""
-    units = tangent_units(cal)
     return {
         "verdict": cal.verdict,
         "reasons": cal.reasons,
+        "findings": [checks_blocks.finding_document(f) for f in cal.checks],
         "status": cal.status,
         "converged": cal.converged,
         "T_HT": {"matrix": cal.T_HT.matrix, "angles_rad": cal.T_HT.angles, "t_mm": cal.T_HT.t},
@@ -53,24 +59,35 @@ def calibration_document(cal: Calibration) -> dict[str, Any]:
             }
             for p in cal.parameters
         ],
-        "covariance": {"names": cal.tangent, "units": units, "matrix": encode(cal.covariance)},
+        "priors": {name: encode(sigma) for name, sigma in cal.priors.items()},
+        "assumed": [{"name": a.name, "sigma": encode(a.sigma), "unit": a.unit, "from": a.source} for a in cal.assumed],
+        "covariance": {"names": cal.tangent, "units": tangent_units(cal), "matrix": encode(cal.covariance)},
         "d_rms_px": cal.d_rms if len(cal.pose_id) else None,
         "d_rms_um": cal.d_rms_um if len(cal.pose_id) else None,
+        "magnification_at_ball": cal.magnification_at_ball,
+        "expected_residual_px": encode(cal.expected_residual),
+        "widening": encode(cal.widening),
         "chi2": encode(cal.chi2),
         "dof": cal.dof,
         "chi2_dof": cal.chi2_dof,
         "model": cal.model,
-        "manipulator": cal.manipulator,
+        "arrangement": cal.arrangement,
+        "manipulator": errors_document(cal.errors),
         "observability": {
             "singular_values": encode(np.asarray(cal.observability.singular_values)),
             "condition": cal.observability.condition,
             "unobservable": cal.observability.unobservable,
             "notes": cal.observability.notes,
         },
-        "hypotheses": cal.hypotheses,
+        "hypotheses": [checks_blocks.hypothesis_document(h) for h in cal.hypotheses],
+        "stability": None if cal.stability is None else checks_blocks.stability_document(cal.stability),
+        "comparison": None if cal.comparison is None else checks_blocks.comparison_document(cal.comparison),
+        "pose_noise": None if cal.pose_noise is None else checks_blocks.flat(cal.pose_noise),
+        "views": None if cal.views is None else checks_blocks.views_document(cal.views),
         "pivot_mm": cal.pivot,
         "convention": cal.convention,
-        "scanner": {"schema": "tomopose/scanner/1", **scanner_document(cal.scanner)},
+        "scanner": _scanner(cal.scanner),
+        "runs": [_scanner(s) for s in cal.runs],
         "residuals": {
             "pose_id": cal.pose_id,
             "u_px": encode(cal.x_D[:, 0]),
@@ -80,9 +97,13 @@ def calibration_document(cal: Calibration) -> dict[str, Any]:
             "d_px": encode(cal.d),
         },
         "outliers": cal.outliers,
-        "extra": cal.extra,
+        "not_seen": cal.not_seen,
         "provenance": None if cal.provenance is None else cal.provenance.to_json(),
     }
+
+
+def _scanner(scanner: Any) -> dict[str, Any]:
+    return {"schema": "tomopose/scanner/1", **scanner_document(scanner)}
 
 
 def tangent_units(cal: Calibration) -> list[str]:
@@ -104,9 +125,9 @@ def read_calibration(path: str | Path) -> Calibration:
 
     Raises FileError or SchemaVersionError where it is no such file, InputError where a part is missing or does not fit.
     """
-    document = read_json(path, "calibration")
+    document = read_json(path, "calibration", version=VERSION)
     try:
-        return _calibration(document, str(path))
+        return _calibration(as_version_2(document), str(path))
     except KeyError as error:
         raise InputError(f"{path}: the key {error} is missing") from error
     except InputError as error:
@@ -119,6 +140,7 @@ def _calibration(document: Mapping[str, Any], where: str) -> Calibration:
     residuals, covariance = document["residuals"], document["covariance"]
     observability, provenance = document["observability"], document.get("provenance")
     ball_ids, t, pivot = document["ball_ids"], document["t_mm"], document.get("pivot_mm")
+    stability, comparison, views = (document.get(k) for k in ("stability", "comparison", "views"))
     if len(ball_ids) != len(t):
         raise InputError(f"{where}: {len(ball_ids)} ball_ids but {len(t)} rows of t_mm")
     m, n = len(covariance["names"]), len(residuals["pose_id"])
@@ -126,7 +148,8 @@ def _calibration(document: Mapping[str, Any], where: str) -> Calibration:
     def columns(u: str, v: str) -> Any:
         return np.column_stack([decode_array(residuals[u], n), decode_array(residuals[v], n)])
 
-    return Calibration(
+    noise = document.get("pose_noise")
+    result = Calibration(
         scanner=scanner_from_document(document["scanner"], f"{where}: scanner"),
         T_HT=_T_HT(document["T_HT"], where),
         balls={int(k): decode_array(row, 3) for k, row in zip(ball_ids, t, strict=True)},
@@ -135,13 +158,13 @@ def _calibration(document: Mapping[str, Any], where: str) -> Calibration:
         pose_id=tuple(residuals["pose_id"]),
         x_D=columns("u_px", "v_px"),
         residuals=columns("residual_u_px", "residual_v_px"),
-        chi2=float(decode_array(document["chi2"])),
+        chi2=_number(document["chi2"]),
         dof=int(document["dof"]),
         parameters=tuple(
             Parameter(
                 name=p["name"],
-                value=float(decode_array(p["value"])),
-                u=float(decode_array(p["standard_uncertainty"])),
+                value=_number(p["value"]),
+                u=_number(p["standard_uncertainty"]),
                 unit=p["unit"],
             )
             for p in document["parameters"]
@@ -152,18 +175,43 @@ def _calibration(document: Mapping[str, Any], where: str) -> Calibration:
             notes=tuple(observability["notes"]),
         ),
         outliers=dict(document["outliers"]),
+        not_seen=dict(document["not_seen"]),
         model=document["model"],
-        manipulator=dict(document["manipulator"]),
+        arrangement=document["arrangement"],
+        errors=errors_from_document(document["manipulator"], inverse=document["arrangement"] != "moving-object"),
+        priors={name: _number(sigma) for name, sigma in document["priors"].items()},
+        assumed=tuple(
+            Assumed(name=a["name"], sigma=_number(a["sigma"]), unit=a["unit"], source=a["from"])
+            for a in document["assumed"]
+        ),
         converged=bool(document["converged"]),
         status=document["status"],
-        verdict=document["verdict"],
-        reasons=tuple(document["reasons"]),
-        hypotheses=tuple(document["hypotheses"]),
+        checks=tuple(checks_blocks.finding_from(f) for f in document["findings"]),
+        hypotheses=tuple(checks_blocks.hypothesis_from(h) for h in document["hypotheses"]),
+        stability=None if stability is None else checks_blocks.stability_from(stability),
+        comparison=None if comparison is None else checks_blocks.comparison_from(comparison),
+        pose_noise=None if noise is None else checks_blocks.pose_noise_from(noise),
+        views=None if views is None else checks_blocks.views_from(views),
+        widening=_number(document["widening"]),
+        expected_residual=_number(document["expected_residual_px"]),
+        magnification_at_ball=None
+        if document.get("magnification_at_ball") is None
+        else float(document["magnification_at_ball"]),
+        runs=tuple(scanner_from_document(s, f"{where}: runs") for s in document["runs"]),
         pivot=None if pivot is None else decode_array(pivot, 3),
         convention=document["convention"],
-        extra=dict(document["extra"]),
         provenance=None if provenance is None else Provenance.from_json(provenance),
     )
+    if result.verdict != document["verdict"]:
+        raise InputError(
+            f"{where}: verdict {document['verdict']!r} is not that of the findings, {result.verdict!r}; the file was "
+            "edited"
+        )
+    return result
+
+
+def _number(value: Any) -> float:
+    return float(decode_array(value))
 
 
 def _T_HT(block: Mapping[str, Any], where: str) -> RigidTransform:

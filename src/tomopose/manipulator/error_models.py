@@ -1,16 +1,11 @@
-"""Identified errors at work: where the real plate is for any pose table, and what to command instead.
+"""A calibration's errors of the manipulator, and what follows from them: where the real plate is, what to command.
 
-`Calibration.manipulator` (and calibration.json) hold a machine with the errors that were found:
+`Calibration.errors` is one of four types, and there are no others:
 
-    {"kind": "hexapod" | "serial" | "map",  "nominal": the machine as in its file,
-     "names", "values", "units", "u": of its errors,
-     "scatter": {"t_mm", "w_rad"}, three each along H, of the plate from pose to pose, with the drift of the run,
-     "lag": {"names", "values"} of worn guides and drives, where the run showed it: it follows the direction from which
-     a table's poses are approached, in their order,
-     "translation_scale": factor on the plate's shifts, where it was freed and is not 1,
-    "arrangement": "moving-scanner" where source and detector move, and poses are inverse ones,
-    "view_sigma": {"d_SD": mm}: scatter of a scanner parameter from view to view,
-     "range": {"t_mm": [low (3), high (3)], "w_rad": [low, high]}: of the calibration's poses}
+    RigidErrors       the poses are trusted, but for a scale of their translations and a scatter;
+    IdentifiedErrors  a hexapod or a robot with the errors of its geometry that were found;
+    EmpiricalErrors   a smooth map of pose errors, for machines whose kinematics nobody knows;
+    TwinErrors        two robots, of source and of detector.
 
 Home of eq. (5) stays the identity: M is the frame that equals H when the controller's zero pose is executed without
 error.  The real plate at commanded zero is one of the corrected poses like any other; the difference is a rigid pose of
@@ -19,31 +14,175 @@ the object, on which no measurement depends.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from tomopose.errors import InputError, OutOfReachError
+from tomopose.errors import InputError, OutOfReachError, ShapeError
 from tomopose.geometry.rotations import log_rotation
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.manipulator.files import hexapod_from_document, serial_from_document
 from tomopose.manipulator.inverse import InverseManipulator, inverse_poses
-from tomopose.manipulator.pose_map import PoseMap
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.manipulator.real_poses import ErrorModel, RealPoses, Repeatability, moved
+from tomopose.manipulator.real_poses import ErrorModel, RealPoses, moved
 from tomopose.manipulator.run_effects import with_run_effects
 from tomopose.manipulator.serial import SerialRobot
-from tomopose.units import Array
+from tomopose.manipulator.twin import TwinRobots, twin_names
+from tomopose.units import Array, float_array
 
-MOVING_SCANNER = "moving-scanner"
-"""Block's "arrangement" where source and detector move and the object does not move."""
 RANGE_MARGIN = 0.1
 """Of the calibrated range's width: as far outside a pose still counts as inside."""
 COMMAND_STEPS = 30
 COMMAND_TOLERANCE = 1e-9
 """mm, and rad at 1000 mm."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseScatter:
+    """Standard deviations of the plate from pose to pose along H: t (3,) mm of its origin, w (3,) rad of its turns.
+
+    about_H: the turns are about the origin of H (tables of inverse poses); else about the plate's own origin.
+    """
+
+    t: Array
+    w: Array
+    about_H: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("t", "w"):
+            object.__setattr__(self, name, float_array(np.broadcast_to(np.asarray(getattr(self, name)), 3)))
+
+    @property
+    def variance(self) -> Array:
+        """(6,) of (w, t), rad^2 and mm^2."""
+        return np.concatenate([self.w**2, self.t**2])
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseRange:
+    """Lowest and highest shift t (3,) mm and rotation vector w (3,) rad of a pose table."""
+
+    t_low: Array
+    t_high: Array
+    w_low: Array
+    w_high: Array
+
+    @classmethod
+    def of(cls, poses: PoseSequence) -> PoseRange:
+        t, w = poses.T_MH.t, log_rotation(poses.T_MH.R)
+        return cls(t_low=t.min(axis=0), t_high=t.max(axis=0), w_low=w.min(axis=0), w_high=w.max(axis=0))
+
+    def outside(self, poses: PoseSequence) -> Any:
+        """(n,) bool: the pose lies outside, with a margin."""
+        x = np.concatenate([poses.T_MH.t, log_rotation(poses.T_MH.R)], axis=1)
+        low, high = (np.concatenate(pair) for pair in ((self.t_low, self.w_low), (self.t_high, self.w_high)))
+        margin = RANGE_MARGIN * (high - low) + np.repeat([1e-3, 1e-6], 3)
+        return ((x < low - margin) | (x > high + margin)).any(axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lag:
+    """Worn guides and drives: names and values (mm) of play, which follows the direction of each move."""
+
+    names: tuple[str, ...]
+    values: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigidErrors:
+    """The poses are trusted.  translation_scale: factor on the plate's shifts; scatter: None where none is known."""
+
+    translation_scale: float = 1.0
+    scatter: PoseScatter | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineErrors:
+    """What identified and empirical errors share.
+
+    machine: the model with its nominal geometry and the priors of its errors.
+    values, u: (m,) the errors found and their standard uncertainties, in the order of machine.names, machine.units.
+    range:     of the poses in which they were found;  scatter: of the plate, with the drift of the run.
+    lag:       where the run showed it;  translation_scale: factor on the plate's shifts.
+    """
+
+    machine: ErrorModel
+    values: Array
+    u: Array
+    range: PoseRange
+    scatter: PoseScatter | None = None
+    lag: Lag | None = None
+    translation_scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        _hold_one_value_each(self, self.machine.names)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.machine.names
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentifiedErrors(MachineErrors):
+    """A hexapod or a robot (an InverseManipulator of one, where it carries the scanner) and the errors that it has."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmpiricalErrors(MachineErrors):
+    """A map of pose errors of low order: nothing is known of the machine."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinErrors:
+    """Twin robots as in `TwinRobots`, without a pose table, and the errors that were found.
+
+    values, u: (m,) in the order of `names`: errors of the detector's robot, of the source's, then the set-up.
+    range, source_range: of the detector's table of inverse poses, and of the source's table.
+    """
+
+    detector: ErrorModel | None
+    source: ErrorModel | None
+    base: RigidTransform
+    focus: Array
+    base_t_sigma: float
+    base_w_sigma: float
+    focus_sigma: float
+    values: Array
+    u: Array
+    range: PoseRange
+    source_range: PoseRange
+    scatter: PoseScatter | None = None
+
+    def __post_init__(self) -> None:
+        _hold_one_value_each(self, self.names)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return twin_names(self.detector, self.source)
+
+    def robots(self, source_poses: PoseSequence) -> TwinRobots:
+        """The twins with a table of the source robot's poses."""
+        return TwinRobots(
+            detector=self.detector,
+            source=self.source,
+            source_poses=source_poses,
+            base=self.base,
+            focus=self.focus,
+            base_t_sigma=self.base_t_sigma,
+            base_w_sigma=self.base_w_sigma,
+            focus_sigma=self.focus_sigma,
+        )
+
+
+Errors: TypeAlias = RigidErrors | IdentifiedErrors | EmpiricalErrors | TwinErrors
+
+
+def _hold_one_value_each(errors: MachineErrors | TwinErrors, names: tuple[str, ...]) -> None:
+    for field in ("values", "u"):
+        value = float_array(getattr(errors, field))
+        if value.shape != (len(names),):
+            raise ShapeError(f"manipulator: names and {field} do not fit: {len(names)} errors, shape {value.shape}")
+        object.__setattr__(errors, field, value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,134 +203,73 @@ class PoseCorrection:
     notes: tuple[str, ...] = ()
 
 
-def manipulator_block(model: ErrorModel, p: Array, u: Array, poses: PoseSequence) -> dict[str, Any]:
-    """The block above for errors p (m,) with standard uncertainties u, found with `poses`."""
-    return {
-        "kind": model.kind,
-        "nominal": model.to_json(),
-        "names": list(model.names),
-        "values": np.asarray(p).tolist(),
-        "units": list(model.units),
-        "u": np.asarray(u).tolist(),
-        "range": pose_range(poses),
-    }
-
-
-def pose_range(poses: PoseSequence) -> dict[str, Any]:
-    """Lowest and highest shift and rotation vector of a table, as in the block's "range"."""
-    t, w = poses.T_MH.t, log_rotation(poses.T_MH.R)
-    return {
-        "t_mm": [t.min(axis=0).tolist(), t.max(axis=0).tolist()],
-        "w_rad": [w.min(axis=0).tolist(), w.max(axis=0).tolist()],
-    }
-
-
-def model_from_block(manipulator: Mapping[str, Any]) -> tuple[ErrorModel, Array]:
-    """The machine and its errors p (m,) from a calibration's block; InputError where the block is damaged."""
-    where = "calibration: manipulator"
-    try:
-        values = np.array(manipulator["values"], dtype=np.float64)
-        kind = manipulator["kind"]
-        model = machine_from_block(kind, manipulator["nominal"], where)
-    except KeyError as error:
-        raise InputError(f"{where}: the key {error} is missing") from error
-    if tuple(manipulator.get("names", ())) != model.names or values.shape != (len(model.names),):
-        raise InputError(f"{where}: names and values do not fit a {kind} with {len(model.names)} errors")
-    return model, values
-
-
-def machine_from_block(kind: str, nominal: Mapping[str, Any], where: str) -> ErrorModel:
-    """The machine of a block's `nominal`."""
-    if kind == "twin":
-        raise InputError(f"{where} holds twin robots, whose scans need two pose tables; use twin_matrices")
-    if kind == "hexapod":
-        return hexapod_from_document(nominal, where)
-    if kind == "serial":
-        return serial_from_document(nominal, where)
-    if kind == "inverse":
-        return InverseManipulator(machine=machine_from_block(nominal["kind"], nominal["machine"], where))
-    if kind == "map":
-        return PoseMap(
-            order=int(nominal["order"]),
-            t_scale=nominal["t_scale_mm"],
-            w_scale=nominal["w_scale_rad"],
-            t_sigma=nominal["t_sigma_mm"],
-            w_sigma=nominal["w_sigma_rad"],
-            factors=nominal.get("factors"),
-            repeatability=Repeatability(**nominal["repeatability"]),
-        )
-    raise InputError(f"{where} has kind {kind!r}; hexapod, serial, map and inverse are known")
-
-
-def machines_of(manipulator: Mapping[str, Any]) -> tuple[ErrorModel | None, ErrorModel | None]:
-    """The nominal machines of a block, without errors: the manipulator's, or those of detector and source of twins;
-    None where it holds none."""
-    where, nominal = "calibration: manipulator", manipulator.get("nominal", {})
-    if manipulator.get("kind") == "twin":
-        twins = {
-            who: machine_from_block(block["kind"], {k: v for k, v in block.items() if k != "kind"}, where)
-            for who, block in nominal.items()
-            if who in ("detector", "source")
-        }
-        return twins.get("detector"), twins.get("source")
-    if "kind" not in manipulator:
+def machines_of(errors: Errors) -> tuple[ErrorModel | None, ErrorModel | None]:
+    """The nominal machines, without errors: the manipulator's, or those of detector and source of twins; None where
+    there is none."""
+    if isinstance(errors, TwinErrors):
+        return errors.detector, errors.source
+    if isinstance(errors, RigidErrors):
         return None, None
-    machine = machine_from_block(manipulator["kind"], nominal, where)
+    machine = errors.machine
     return (machine.machine if isinstance(machine, InverseManipulator) else machine), None
 
 
-def _executed(
-    manipulator: Mapping[str, Any], poses: PoseSequence, moves: PoseSequence
-) -> tuple[RealPoses, tuple[str, ...]]:
+def _executed(errors: MachineErrors, poses: PoseSequence, moves: PoseSequence) -> tuple[RealPoses, tuple[str, ...]]:
     """Where the real plate is for commanded poses, with lags as of the table `moves`, and the errors' names."""
-    model, p = model_from_block(manipulator)
-    lag = manipulator.get("lag")
-    if lag is None:
+    model, p = errors.machine, errors.values
+    if errors.lag is None:
         return model.real_poses(poses, p), model.names
     worn = with_run_effects(model, moves)
-    values, still = np.array(lag["values"], dtype=np.float64), worn.drift
-    if tuple(lag["names"]) != worn.names[still.stop :] or values.shape != (len(worn.names) - still.stop,):
+    values, still = errors.lag.values, worn.drift
+    if errors.lag.names != worn.names[still.stop :] or values.shape != (len(worn.names) - still.stop,):
         raise InputError(f"calibration: manipulator: names and values of the lag do not fit a {model.kind}")
     real = worn.real_poses(poses, np.concatenate([p, np.zeros(still.stop - still.start), values]))
     J = np.delete(real.J, np.arange(still.start, still.stop), axis=2)
     return replace(real, J=J), (*model.names, *worn.names[still.stop :])
 
 
-def correction(manipulator: Mapping[str, Any], poses: PoseSequence) -> PoseCorrection:
-    """The table with the poses of the real plate, its Jacobian and what lies outside the calibrated range.
+def require_one_table(errors: Errors) -> RigidErrors | MachineErrors:
+    """The errors of a single manipulator; InputError for twins, whose scans have two tables."""
+    if isinstance(errors, TwinErrors):
+        raise InputError("the calibration is of twin robots, whose scans need two pose tables; use twin_matrices")
+    return errors
 
-    A block without a machine (a rigid calibration) leaves the poses as they are.
-    """
-    n = len(poses)
-    if "kind" not in manipulator:
-        return PoseCorrection(poses=poses, J=np.zeros((n, 6, 0)), names=(), outside=np.zeros(n, dtype=bool))
-    real, names = _executed(manipulator, poses, poses)
-    scale = float(manipulator.get("translation_scale", 1.0))
+
+def correction(errors: Errors, poses: PoseSequence) -> PoseCorrection:
+    """The table with the poses of the real plate, its Jacobian and what lies outside the calibrated range."""
+    own, n = require_one_table(errors), len(poses)
+    scale = own.translation_scale
+    if isinstance(own, RigidErrors):
+        where = poses if scale == 1.0 else replace(poses, T_MH=replace(poses.T_MH, t=scale * poses.T_MH.t))
+        return PoseCorrection(poses=where, J=np.zeros((n, 6, 0)), names=(), outside=np.zeros(n, dtype=bool))
+    real, names = _executed(own, poses, poses)
     T_MH = replace(real.T_MH, t=scale * real.t)
     J = np.concatenate([real.J[:, :3], scale * real.J[:, 3:]], axis=1)
-    outside = outside_range(manipulator["range"], poses)
+    outside = own.range.outside(poses)
     return PoseCorrection(
         poses=replace(poses, T_MH=T_MH), J=J, names=names, outside=outside, notes=outside_notes(outside, poses)
     )
 
 
-def corrected_poses(manipulator: Mapping[str, Any], poses: PoseSequence) -> PoseSequence:
+def corrected_poses(errors: Errors, poses: PoseSequence) -> PoseSequence:
     """The table with T_MH of the real plate in place of the controller's."""
-    return correction(manipulator, poses).poses
+    return correction(errors, poses).poses
 
 
-def commands_for(manipulator: Mapping[str, Any], wanted: PoseSequence) -> PoseSequence:
+def commands_for(errors: Errors, wanted: PoseSequence) -> PoseSequence:
     """The table to command so that the real plate reaches the poses `wanted`: the inverse correction.
 
     Joint values are returned too where `wanted` has them (they say which branch of a robot is meant).
     Raises OutOfReachError, naming the poses, where the real machine cannot get there.
     """
-    if "kind" not in manipulator:
-        return wanted
-    if manipulator["kind"] == "inverse" and "lag" not in manipulator:
-        inner = {**manipulator, "kind": manipulator["nominal"]["kind"], "nominal": manipulator["nominal"]["machine"]}
+    own = require_one_table(errors)
+    scale = own.translation_scale
+    if isinstance(own, RigidErrors):
+        return wanted if scale == 1.0 else replace(wanted, T_MH=replace(wanted.T_MH, t=wanted.T_MH.t / scale))
+    if isinstance(own.machine, InverseManipulator) and own.lag is None:
+        inner = replace(own, machine=own.machine.machine)
         return inverse_poses(commands_for(inner, inverse_poses(wanted)))
-    model, _ = model_from_block(manipulator)
+    model = own.machine
     command = replace(wanted, q=None)
     extra = None
     if isinstance(model, SerialRobot):
@@ -203,9 +281,9 @@ def commands_for(manipulator: Mapping[str, Any], wanted: PoseSequence) -> PoseSe
         q, extra = model.joint_values(wanted)
         command = replace(wanted, q=q)
     for _ in range(COMMAND_STEPS):
-        real, _ = _executed(manipulator, command, wanted)
+        real, _ = _executed(own, command, wanted)
         w = log_rotation(wanted.T_MH.R @ np.swapaxes(real.R, 1, 2))
-        delta = np.concatenate([w, wanted.T_MH.t - real.t], axis=1)
+        delta = np.concatenate([w, wanted.T_MH.t - scale * real.t], axis=1)
         miss = np.maximum(np.abs(delta[:, :3]).max(axis=1) * 1000.0, np.abs(delta[:, 3:]).max(axis=1))
         if miss.max() < COMMAND_TOLERANCE:
             return command if wanted.q is not None else replace(command, q=None)
@@ -226,15 +304,6 @@ def commands_for(manipulator: Mapping[str, Any], wanted: PoseSequence) -> PoseSe
     )
 
 
-def outside_range(limits: Mapping[str, Any], poses: PoseSequence) -> Any:
-    """(n,) bool: the pose lies outside a block's "range", with a margin."""
-    x = np.concatenate([poses.T_MH.t, log_rotation(poses.T_MH.R)], axis=1)
-    low = np.concatenate([limits["t_mm"][0], limits["w_rad"][0]])
-    high = np.concatenate([limits["t_mm"][1], limits["w_rad"][1]])
-    margin = RANGE_MARGIN * (high - low) + np.repeat([1e-3, 1e-6], 3)
-    return ((x < low - margin) | (x > high + margin)).any(axis=1)
-
-
 def outside_notes(outside: Any, poses: PoseSequence, whose: str = "the manipulator's") -> tuple[str, ...]:
     """The sentence on poses outside the range in which `whose` errors were identified; none where all lie inside."""
     if not outside.any():
@@ -244,8 +313,3 @@ def outside_notes(outside: Any, poses: PoseSequence, whose: str = "the manipulat
         f"the first is {poses.pose_id[int(np.flatnonzero(outside)[0])]!r}; there the correction rests on the model "
         "alone",
     )
-
-
-def moving_scanner(manipulator: Mapping[str, Any]) -> bool:
-    """Whether the block is of a manipulator that carries source and detector, so that tables hold inverse poses."""
-    return manipulator.get("arrangement") == MOVING_SCANNER or manipulator.get("kind") == "inverse"

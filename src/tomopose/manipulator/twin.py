@@ -12,9 +12,8 @@ each other and where the focal spot sits are known roughly; they are unknowns be
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -27,6 +26,12 @@ from tomopose.manipulator.real_poses import ErrorModel, RealPoses, Repeatability
 from tomopose.units import Array, float_array
 
 SETUP = tuple(f"{what}_{c}" for what in ("base_w", "base_t", "focus") for c in "xyz")
+
+
+def twin_names(detector: ErrorModel | None, source: ErrorModel | None) -> tuple[str, ...]:
+    """The errors of twin robots in their order: of the detector's, of the source's, then of their set-up."""
+    machines = (("detector", detector), ("source", source))
+    return (*(f"{who}_{name}" for who, machine in machines if machine is not None for name in machine.names), *SETUP)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +77,7 @@ class TwinRobots:
 
     @property
     def names(self) -> tuple[str, ...]:
-        return (*(f"{who}_{name}" for who, machine in self._machines() for name in machine.names), *SETUP)
+        return twin_names(self.detector, self.source)
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -98,7 +103,7 @@ class TwinRobots:
         return replace(self, detector=None, source=None)
 
     def _split(self, p: Array) -> tuple[Array, Array, Array]:
-        p = np.asarray(p, dtype=np.float64)
+        p = np.array(p, dtype=np.float64)  # a copy that may be written: rotations refuse others
         if p.shape != (len(self.names),):
             raise ShapeError(f"these twin robots have {len(self.names)} errors; got {p.shape}")
         first = 0 if self.detector is None else len(self.detector.names)
@@ -143,38 +148,36 @@ class TwinRobots:
 
     def to_json(self) -> dict[str, Any]:
         """All but the source's pose table, which belongs to a run."""
-        return {
-            **{who: {"kind": machine.kind, **machine.to_json()} for who, machine in self._machines()},
-            "base": self.base.matrix.tolist(),
-            "focus_mm": self.focus.tolist(),
-            "base_t_sigma_mm": self.base_t_sigma,
-            "base_w_sigma_rad": self.base_w_sigma,
-            "focus_sigma_mm": self.focus_sigma,
-        }
+        return twin_document(self)
 
 
-def twin_from_document(
-    document: Mapping[str, Any], source_poses: PoseSequence, machine_from: Any, where: str
-) -> TwinRobots:
-    """Twin robots from `to_json`'s content; machine_from(kind, document, where) reads either machine."""
-    try:
-        machines = {
-            who: machine_from(document[who]["kind"], {k: v for k, v in document[who].items() if k != "kind"}, where)
-            if who in document
-            else None
-            for who in ("detector", "source")
-        }
-        base = RigidTransform.from_matrix(
-            np.asarray(document["base"]), source=source_poses.T_MH.target, target=source_poses.T_MH.target
-        )
-        return TwinRobots(
-            **machines,
-            source_poses=source_poses,
-            base=base,
-            focus=document["focus_mm"],
-            base_t_sigma=float(document["base_t_sigma_mm"]),
-            base_w_sigma=float(document["base_w_sigma_rad"]),
-            focus_sigma=float(document["focus_sigma_mm"]),
-        )
-    except KeyError as error:
-        raise InputError(f"{where}: the key {error} is missing") from error
+class TwinSetup(Protocol):
+    """What describes twin robots beside the tables of a run."""
+
+    @property
+    def detector(self) -> ErrorModel | None: ...
+    @property
+    def source(self) -> ErrorModel | None: ...
+    @property
+    def base(self) -> RigidTransform: ...
+    @property
+    def focus(self) -> Array: ...
+    @property
+    def base_t_sigma(self) -> float: ...
+    @property
+    def base_w_sigma(self) -> float: ...
+    @property
+    def focus_sigma(self) -> float: ...
+
+
+def twin_document(twin: TwinSetup) -> dict[str, Any]:
+    """The description as JSON knows it."""
+    machines = (("detector", twin.detector), ("source", twin.source))
+    return {
+        **{who: {"kind": machine.kind, **machine.to_json()} for who, machine in machines if machine is not None},
+        "base": twin.base.matrix.tolist(),
+        "focus_mm": np.asarray(twin.focus).tolist(),
+        "base_t_sigma_mm": twin.base_t_sigma,
+        "base_w_sigma_rad": twin.base_w_sigma,
+        "focus_sigma_mm": twin.focus_sigma,
+    }

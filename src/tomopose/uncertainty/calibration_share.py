@@ -17,7 +17,7 @@ from tomopose.calibration.uncertainty.propagation import apparent_displacement
 from tomopose.calibration.uncertainty.trajectory import pixels, point_jacobian, trajectory_jacobian
 from tomopose.errors import InputError
 from tomopose.geometry.projection import eq5_matrices
-from tomopose.manipulator.error_models import correction
+from tomopose.manipulator.error_models import RigidErrors, correction
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.measurement.bench import refitted
 from tomopose.measurement.features.feature import Feature
@@ -38,9 +38,9 @@ def displacement_field(calibration: Calibration, poses: PoseSequence, x_W: Array
 
     poses: the scan's, as commanded.  With identified errors of the manipulator the object's rigid pose is removed.
     """
-    if "kind" not in calibration.manipulator:
+    if isinstance(calibration.errors, RigidErrors):
         return apparent_displacement(calibration, poses, x_W)
-    T_MH = correction(calibration.manipulator, poses).poses.T_MH
+    T_MH = correction(calibration.errors, poses).poses.T_MH
     alpha = np.zeros(len(poses)) if poses.alpha is None else poses.alpha
     P = eq5_matrices(calibration.scanner, T_HT=calibration.T_HT, T_MH=T_MH, alpha=alpha)
     if not np.isfinite(pixels(P, x_W)).all():

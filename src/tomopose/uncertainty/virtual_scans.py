@@ -28,7 +28,7 @@ from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
 from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.manipulator.error_models import correction
+from tomopose.manipulator.error_models import RigidErrors, correction
 from tomopose.manipulator.real_poses import moved
 from tomopose.measurement.measure import measure
 from tomopose.measurement.plan import MeasurementPlan
@@ -184,9 +184,9 @@ def _require_same_detector(own: Scanner, calibration: Calibration) -> None:
 
 def _drawn_poses(run: SimulatedRun, calibration: Calibration, delta: Array) -> RigidTransform:
     """Where the plate is believed to stand, after a step delta in the manipulator's errors."""
-    if "kind" not in calibration.manipulator:
+    if isinstance(calibration.errors, RigidErrors):
         return run.poses.T_MH
-    fixed = correction(calibration.manipulator, run.poses)
+    fixed = correction(calibration.errors, run.poses)
     errs = not np.allclose(run.T_MH.matrix, run.poses.T_MH.matrix, atol=1e-9)
     T = fixed.poses.T_MH if errs else run.poses.T_MH
     R, t = moved(T.R, T.t, fixed.J @ delta[[calibration.tangent.index(name) for name in fixed.names]])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,11 +11,11 @@ import numpy as np
 from tomopose.calibration.checks.conventions import RIVALS_OF_MOVING_SCANNER
 from tomopose.calibration.identified.calibrate import calibrate_kinematic, machine_of
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
-from tomopose.calibration.result import Calibration
-from tomopose.calibration.solve import calibrate
+from tomopose.calibration.result import Calibration, ViewDistances
+from tomopose.calibration.solve import rigid_calibration
 from tomopose.errors import InputError, NotConvergedError, NotObservableError
 from tomopose.geometry.scanner import Scanner
-from tomopose.manipulator.error_models import MOVING_SCANNER, corrected_poses
+from tomopose.manipulator.error_models import corrected_poses
 from tomopose.manipulator.inverse import InverseManipulator, inverse_poses
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
@@ -31,7 +31,10 @@ def calibrate_inverse(
     model: str = "auto",
     d_SD_sigma: float = 0.0,
     distances: Mapping[tuple[int, int], tuple[float, float]] | None = None,
-    **options: Any,
+    free: Sequence[str] = (),
+    fix: Sequence[str] = (),
+    priors: Mapping[str, float] | None = None,
+    robust: bool = True,
 ) -> Calibration:
     """Find the scanner's mount on the moved plate and the ball in the base.  Eq. (6) over the inverse chain.
 
@@ -41,8 +44,8 @@ def calibrate_inverse(
     poses:        T_MH of the plate that carries source and detector; the table angle must be 0.
     manipulator, model, distances: as in `calibrate`.
     d_SD_sigma:   mm, standard deviation of d_SD from view to view; 0: source and detector are fixed to one another.
-                  The result's `extra` then holds "view_d_SD", the distance of every view.
-    options:      free, fix, priors, robust of `calibrate`.
+                  The result's `views` then holds the distance of every view.
+    free, fix, priors, robust: as in `calibrate`.
 
     Returns
     -------
@@ -59,7 +62,7 @@ def calibrate_inverse(
         raise InputError(f"d_SD_sigma is {d_SD_sigma}; a standard deviation >= 0 in mm is needed")
     if d_SD_sigma and model == "slack":
         raise InputError("a d_SD that differs from view to view cannot be told from poses that scatter (model slack)")
-    for name in options.get("free", ()):
+    for name in free:
         if name == "d_SR" or name.startswith("axis"):
             raise NotObservableError(
                 f"{name} says only where W begins on a scanner that moves as a whole; no image depends on it beside "
@@ -71,11 +74,23 @@ def calibrate_inverse(
         raise InputError("distances between balls serve models with the manipulator's errors; give its geometry")
     turned = inverse_poses(poses)
     try:
-        found = calibrate(scanner, turned, observations, model="rigid", hypotheses=RIVALS_OF_MOVING_SCANNER, **options)
+        found, freed = rigid_calibration(
+            scanner,
+            turned,
+            observations,
+            hypotheses=RIVALS_OF_MOVING_SCANNER,
+            arrangement="moving-scanner",
+            free=free,
+            fix=fix,
+            priors=priors,
+            robust=robust,
+        )
     except NotConvergedError as error:
         if isinstance(error.calibration, Calibration):
-            error.calibration = replace(error.calibration, manipulator={"arrangement": MOVING_SCANNER})
+            error.calibration = replace(error.calibration, arrangement="moving-scanner")
         raise
+    if found.verdict == "rejected":
+        return found
     if machine is not None or d_SD_sigma or model not in ("auto", "rigid"):
         found = calibrate_kinematic(
             scanner,
@@ -84,19 +99,17 @@ def calibrate_inverse(
             rigid=found,
             manipulator=None if machine is None else InverseManipulator(machine=machine),
             model="rigid" if machine is None and model == "auto" else model,
+            free=freed,
             distances=distances,
             inverse=True,
             view_sigma={"d_SD": d_SD_sigma} if d_SD_sigma else None,
         )
-    block = {**found.manipulator, "arrangement": MOVING_SCANNER}
     if not d_SD_sigma:
-        return replace(found, manipulator=block)
+        return found
     seen = observations.select(np.isin(observations.pose_id, found.pose_id))
     d_SD, u = view_distances(found, poses, seen, d_SD_sigma=d_SD_sigma)
-    views = {"pose_id": list(seen.pose_id), "d_SD_mm": d_SD.tolist(), "u_mm": u.tolist()}
-    return replace(
-        found, manipulator={**block, "view_sigma": {"d_SD": d_SD_sigma}}, extra={**found.extra, "view_d_SD": views}
-    )
+    views = ViewDistances(sigma=d_SD_sigma, pose_id=tuple(seen.pose_id), d_SD=d_SD, u=u)
+    return replace(found, views=views)
 
 
 def view_distances(
@@ -108,7 +121,7 @@ def view_distances(
     d_SD_sigma.  poses: as given to `calibrate_inverse`; rows as in `observations`.
     """
     rows = inverse_poses(poses).select(poses.index_of(observations.pose_id))
-    real = corrected_poses(calibration.manipulator, rows)
+    real = corrected_poses(calibration.errors, rows)
     centres = np.array([calibration.balls[int(i)] for i in np.asarray(rows.ball_id)])
     b = projection_blocks(calibration.scanner, T_HT=calibration.T_HT, T_MH=real.T_MH, t=centres, alpha=rows.alpha)
     g = b.J_scanner[:, :, SCANNER_COLUMNS.index("d_SD")]

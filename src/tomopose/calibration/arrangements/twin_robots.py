@@ -11,7 +11,7 @@ import numpy as np
 from tomopose.calibration.identified.calibrate import known_bars
 from tomopose.calibration.identified.fit import ModelFit, fit_model
 from tomopose.calibration.identified.map_estimate import KinematicProblem, State, linearise
-from tomopose.calibration.identified.model_selection import better, judge
+from tomopose.calibration.identified.model_selection import better, judged
 from tomopose.calibration.identified.result import calibration_of
 from tomopose.calibration.identified.scale_bars import require_balls_not_swapped
 from tomopose.calibration.model.parameters import MATTERS, UNITS, FreeParameters, free_parameters, unit_of
@@ -26,11 +26,12 @@ from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.geometry.rotations import skew
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.manipulator.error_models import machine_from_block, outside_notes, outside_range, pose_range
+from tomopose.manipulator.error_models import TwinErrors, outside_notes
 from tomopose.manipulator.inverse import inverse_poses
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.manipulator.twin import TwinRobots, twin_from_document
+from tomopose.manipulator.twin import TwinRobots
 from tomopose.observations import BallObservations
+from tomopose.provenance import provenance
 from tomopose.units import Array
 
 MODELS = ("auto", "rigid", "kinematic")
@@ -128,16 +129,46 @@ def calibrate_twin(
         begin = replace(start, p=np.concatenate([np.zeros(len(machines.names) - 9), start.p]))
         fits[name] = fit_model(problem, begin, robust=robust and name == "kinematic")
         start = fits[name].estimate.state
-    judged = {name: judge(name, fit) for name, fit in fits.items()}
+    found = {name: judged(name, fit) for name, fit in fits.items()}
     chosen = model
     if model == "auto":
-        chosen = "kinematic" if better(judged["kinematic"], judged["rigid"]) else "rigid"
+        chosen = "kinematic" if better(found["kinematic"], found["rigid"]) else "rigid"
     fit = max(fits.values(), key=lambda f: f.estimate.log_evidence)
     require_balls_not_swapped(fit, fit.estimate.problem if fit.keep.all() else problem)
-    _require_panel_told(fits[chosen])
-    found = calibration_of(None, fits, judged, chosen, model, data.pose_id, ())
-    source = twin.source_poses.select(twin.source_poses.index_of(data.pose_id))
-    return replace(found, manipulator={**found.manipulator, "source_range": pose_range(source)})
+    _require_panel_known(fits[chosen])
+    return calibration_of(
+        fits,
+        found,
+        chosen,
+        asked=model,
+        everything=data,
+        arrangement="twin",
+        magnification_at_ball=_magnification_at_balls(fits[chosen]),
+        source_poses=twin.source_poses.select(twin.source_poses.index_of(data.pose_id)),
+        provenance=provenance(arguments={"model": model}),
+    )
+
+
+def _magnification_at_balls(fit: ModelFit) -> float:
+    """Mean over the views of d_SD over the ball's distance from the focal spot, along the panel's normal."""
+    e = fit.estimate
+    twin = e.problem.model
+    if not isinstance(twin, TwinRobots):
+        raise TypeError(f"a fit of twin robots is needed; its model is {type(twin).__name__}")
+    data, scanner = e.problem.data, e.problem.data.scanner
+    P = twin_view_matrices(scanner, twin, T_HT=e.state.T_HT, poses=e.problem.poses, p=e.state.p)
+    own = ProjectionMatrices(
+        P=P,
+        n_u=scanner.n_u,
+        n_v=scanner.n_v,
+        p_u=scanner.p_u,
+        p_v=scanner.p_v,
+        pose_id=data.pose_id,
+        in_front=e.state.balls.mean(axis=0),
+    )
+    x = e.state.balls[data.ball]
+    depth = np.einsum("nj,nj->n", own.P[:, 2, :3], x) + own.P[:, 2, 3]
+    return float(np.mean(own.decompose().d_SD / depth))
 
 
 def _require_both_tables(pose_id: Sequence[str], source_poses: PoseSequence) -> None:
@@ -150,7 +181,7 @@ def _require_both_tables(pose_id: Sequence[str], source_poses: PoseSequence) -> 
         )
 
 
-def _require_panel_told(fit: ModelFit) -> None:
+def _require_panel_known(fit: ModelFit) -> None:
     """NotObservableError where a freed pitch stays less certain than what matters to a scan."""
     e = fit.estimate
     u = np.sqrt(np.diag(e.covariance))[6 + e.state.balls.size :]
@@ -164,11 +195,9 @@ def _require_panel_told(fit: ModelFit) -> None:
 
 
 def _twin_of(calibration: Calibration, source_poses: PoseSequence) -> tuple[TwinRobots, Array]:
-    block = calibration.manipulator
-    if block.get("kind") != "twin":
+    if not isinstance(calibration.errors, TwinErrors):
         raise InputError("this calibration is not one of twin robots; use projection_matrices")
-    twin = twin_from_document(block["nominal"], source_poses, machine_from_block, "calibration: manipulator")
-    return twin, np.asarray(block["values"], dtype=np.float64)
+    return calibration.errors.robots(source_poses), calibration.errors.values
 
 
 def twin_matrices(
@@ -215,10 +244,12 @@ def twin_matrices(
 
 def twin_notes(calibration: Calibration, poses: PoseSequence, source_poses: PoseSequence) -> tuple[str, ...]:
     """Sentences on poses of a scan that lie outside the calibrated range of either robot."""
-    block, turned = calibration.manipulator, inverse_poses(poses)
+    errors, turned = calibration.errors, inverse_poses(poses)
+    if not isinstance(errors, TwinErrors):
+        raise InputError("this calibration is not one of twin robots; it has one pose table")
     return (
-        *outside_notes(outside_range(block["range"], turned), poses, "the detector robot's"),
-        *outside_notes(outside_range(block["source_range"], source_poses), source_poses, "the source robot's"),
+        *outside_notes(errors.range.outside(turned), poses, "the detector robot's"),
+        *outside_notes(errors.source_range.outside(source_poses), source_poses, "the source robot's"),
     )
 
 

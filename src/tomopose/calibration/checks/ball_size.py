@@ -6,21 +6,43 @@ centres as another mount would. The ball's diameter is a length of its own, and 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Protocol
+
 import numpy as np
 
-from tomopose.calibration.result import Calibration
+from tomopose.calibration.checks.rules import BallSize, Evidence, ball_size_rules, findings
+from tomopose.calibration.checks.verdict import Finding
 from tomopose.errors import InputError
+from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.silhouette import silhouette_ellipse
+from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
+from tomopose.units import Array
 
-NOTED, WRONG = 0.005, 0.02
-"""Relative differences of size from which one is told, and from which a value must be wrong."""
+WRONG = 0.02
+"""Relative difference of size from which a value that was given must be wrong: two pixels at a radius of 100 px."""
 
 
-def size_ratio(
-    calibration: Calibration, poses: PoseSequence, observations: BallObservations, ball_diameter: float
-) -> float:
+class Placed(Protocol):
+    """Where a calibration puts the balls."""
+
+    @property
+    def scanner(self) -> Scanner: ...
+    @property
+    def T_HT(self) -> RigidTransform: ...
+    @property
+    def balls(self) -> Mapping[int, Array]: ...
+    @property
+    def pose_id(self) -> tuple[str, ...]: ...
+    @property
+    def model(self) -> str: ...
+    @property
+    def arrangement(self) -> str: ...
+
+
+def size_ratio(calibration: Placed, poses: PoseSequence, observations: BallObservations, ball_diameter: float) -> float:
     """Median over the poses used of the measured size of the silhouette over the calculated one; NaN without sizes.
 
     calibration: of one ball.  poses: those of its chain as commanded (inverse ones where the scanner moves).
@@ -41,15 +63,17 @@ def size_ratio(
     return float(np.sqrt(np.nanmedian(sizes)))
 
 
-def require_ball_size(ratio: float, ball_diameter: float) -> str | None:
-    """A sentence where the size is off by more than 0.5 %, else None.  InputError where it is off by more than 2 %."""
-    if not abs(ratio - 1.0) > NOTED:
-        return None
-    words = (
-        f"the ball's silhouettes are {100 * abs(ratio - 1.0):.1f} % {'larger' if ratio > 1 else 'smaller'} than a ball "
-        f"of {ball_diameter:g} mm would throw from where the calibration places it; the diameter (--ball-diameter-mm), "
-        "the scale of the poses' translations or a value in scanner.json is wrong"
+def ball_size_findings(
+    calibration: Placed, poses: PoseSequence, observations: BallObservations, ball_diameter: float
+) -> tuple[Finding, ...]:
+    """What the silhouettes say, by the rules; arguments as of `size_ratio`.
+
+    InputError where the size is off by more than 2 %.
+    """
+    size = BallSize(ratio=size_ratio(calibration, poses, observations, ball_diameter), diameter=ball_diameter)
+    found = findings(
+        Evidence.of_ball_size(size, model=calibration.model, arrangement=calibration.arrangement), ball_size_rules()
     )
-    if abs(ratio - 1.0) > WRONG:
-        raise InputError(words)
-    return words
+    if abs(size.ratio - 1.0) > WRONG:
+        raise InputError(size.words)
+    return found

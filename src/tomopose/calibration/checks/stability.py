@@ -7,23 +7,23 @@ an F test against what it leaves.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
+from math import comb
 from typing import Any
 
 import numpy as np
 from scipy.special import fdtrc
 
-from tomopose.calibration.model.covariance import inverse_information
+from tomopose.calibration.checks.cross_validation import held_out
+from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters
 from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.rigid.fit import Fit, blocks, jacobian, minimise, residuals
+from tomopose.calibration.rigid.fit import Fit, linear_fit
 from tomopose.geometry.rotations import rotation_angle_between
 from tomopose.units import Array
 
-BLOCKS = 5
 DRIFT_ORDER = 3
 REPEATED_MM, REPEATED_RAD = 0.02, 2e-4
 SIGNIFICANT = 1e-4
@@ -46,41 +46,43 @@ class Effect:
     words: str
     at: str = ""
 
-    def to_json(self) -> dict[str, Any]:
-        return {
-            "name": self.name,
-            "p": self.p,
-            "size_px": self.size_px,
-            "share": self.share,
-            "words": self.words,
-            "at": self.at,
-        }
+
+@dataclass(frozen=True, kw_only=True)
+class RepeatedPose:
+    """A pose taken again: the distance of its two centres in px and in standard deviations."""
+
+    first: str
+    again: str
+    distance_px: float
+    sigmas: float
 
 
 @dataclass(frozen=True, kw_only=True)
-class Integrity:
-    """effects: drift and change points (significant or not);  repeats: pairs of poses taken twice, with the distance of
-    their centres (px and standard deviations);  held_out_rms, fit_rms: px, blocked cross-validation beside the fit;
+class OutlierBlock:
+    """A run of neighbouring poses, `first` to `last`, whose centres were all set aside; p: probability by chance."""
+
+    first: str
+    last: str
+    count: int
+    p: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stability:
+    """effects: drift and change points (significant or not);  repeats: poses taken twice, set aside or not;
+    block: the longest run of poses set aside;  held_out_rms, fit_rms: px, blocked cross-validation beside the fit;
     held_out_chi2: mean squared prediction error in its own predicted standard deviations (1 where all is well)."""
 
     effects: tuple[Effect, ...]
-    repeats: tuple[dict[str, Any], ...]
+    repeats: tuple[RepeatedPose, ...]
     held_out_rms: float
     held_out_chi2: float
     fit_rms: float
+    block: OutlierBlock | None = None
 
     @property
     def significant(self) -> tuple[Effect, ...]:
         return tuple(e for e in self.effects if e.p < SIGNIFICANT)
-
-    def to_json(self) -> dict[str, Any]:
-        return {
-            "effects": [e.to_json() for e in self.effects],
-            "repeats": list(self.repeats),
-            "held_out_rms_px": self.held_out_rms,
-            "held_out_chi2": self.held_out_chi2,
-            "fit_rms_px": self.fit_rms,
-        }
 
 
 def elapsed(problem: Problem) -> Array:
@@ -101,32 +103,29 @@ def _without(C: Array, A: Array) -> Array:
     return np.asarray(C - A @ np.linalg.lstsq(A, C, rcond=1e-10)[0], dtype=np.float64)
 
 
-def drift(
-    problem: Problem, Jw: Array, rw: Array, columns: Array, *, name: str, words: str, unit: tuple[float, str]
-) -> Effect:
+def drift(fit: LinearFit, columns: Array, *, name: str, words: str, unit: tuple[float, str]) -> Effect:
     """A slow change of the coordinates behind `columns` (n, 2, c), whitened derivatives: cubic in time, about a
     constant that is free.
 
     words: with {} for the largest distance between two moments of the run, given in unit (factor, name).
     """
     c = columns.shape[2]
-    tau = elapsed(problem)
+    tau = elapsed(fit.problem)
     course = np.polynomial.legendre.legvander(2.0 * tau / np.ptp(tau) - 1.0, DRIFT_ORDER)[:, 1:]
-    C = (columns[:, :, None, :] * course[:, None, :, None]).reshape(-1, DRIFT_ORDER * c)
-    known = np.concatenate([Jw.reshape(-1, Jw.shape[2]), columns.reshape(-1, c)], axis=1)
-    rest = _without(rw.reshape(-1, 1), known)
+    moved = (columns[:, :, None, :] * course[:, None, :, None]).reshape(len(columns), 2, DRIFT_ORDER * c)
+    C, known = fit.with_priors(moved), np.concatenate([fit.rows, fit.with_priors(columns)], axis=1)
+    rest = _without(fit.residuals[:, None], known)
     move = np.linalg.lstsq(_without(C, known), rest, rcond=1e-8)[0].ravel()
     after = _without(rest, np.concatenate([known, C], axis=1))
-    before = float((rest**2).sum())
-    left = float((after**2).sum())
+    before, left = float((rest**2).sum()), float((after**2).sum())
     gain = before - left
     path = course @ move.reshape(DRIFT_ORDER, c)
     reach = float(np.linalg.norm(path[:, None] - path[None], axis=2).max())
-    size = _size_px(problem, (C @ move).reshape(-1, 2))
+    size = _size_px(fit, moved @ move)
     factor, symbol = unit
     return Effect(
         name=name,
-        p=_p(gain, C.shape[1], left, rw.size - known.shape[1] - C.shape[1]),
+        p=_p(gain, C.shape[1], left, len(rest) - known.shape[1] - C.shape[1]),
         size_px=size,
         share=gain / max(before, 1e-300),
         words=f"{words.format(f'{reach * factor:.2g} {symbol}')} over the run, {size:.2g} px rms",
@@ -141,24 +140,22 @@ def _p(gain: float, c: int, left: float, dof: int) -> float:
     return float(fdtrc(c, dof, max(gain, 0.0) / c / max(left / dof, 1e-300)))
 
 
-def _share(explained: float, rw: Array) -> float:
-    return explained / max(float((rw**2).sum()), 1e-300)
-
-
-def _size_px(problem: Problem, whitened: Array) -> float:
-    px = np.linalg.solve(problem.W, whitened[:, :, None])[..., 0]
+def _size_px(fit: LinearFit, whitened: Array) -> float:
+    px = np.linalg.solve(fit.W, whitened[:, :, None])[..., 0]
     return float(np.sqrt((px**2).sum(axis=1).mean()))
 
 
-def change_point(problem: Problem, Jw: Array, rw: Array, columns: Array, *, name: str, words: str) -> Effect | None:
+def change_point(fit: LinearFit, columns: Array, *, name: str, words: str) -> Effect | None:
     """The place where a sudden change of the coordinates behind `columns` (n, 2, c) explains most of chi2.
 
     Every place with at least c poses on both sides is tried; p counts all of them (Bonferroni).
     """
-    n, c = len(problem), columns.shape[2]
+    n, c = len(fit.problem), columns.shape[2]
     if n < 4 * c:
         return None
-    Q = np.linalg.qr(Jw.reshape(-1, Jw.shape[2]))[0].reshape(n, 2, -1)
+    known = np.linalg.qr(fit.rows / np.maximum(np.linalg.norm(fit.rows, axis=0), 1e-300))[0]
+    rest = fit.residuals - known @ (known.T @ fit.residuals)
+    Q, rw = known[: 2 * n].reshape(n, 2, -1), rest[: 2 * n].reshape(n, 2)
 
     def after(x: Array) -> Array:
         return np.cumsum(x[::-1], axis=0)[::-1]
@@ -177,20 +174,21 @@ def change_point(problem: Problem, Jw: Array, rw: Array, columns: Array, *, name
     k = int(places[gain.argmax()])
     step = np.linalg.lstsq(M[k], g[k], rcond=1e-8)[0]
     late = columns * (np.arange(n) >= k)[:, None, None]
-    size = _size_px(problem, late @ step)
-    best = float(gain.max())
-    p = _p(best, c, float((rw**2).sum()) - best, rw.size - Jw.shape[2] - c)
+    size = _size_px(fit, late @ step)
+    best, before = float(gain.max()), float((rest**2).sum())
+    p = _p(best, c, before - best, len(rest) - fit.J.shape[2] - c)
     return Effect(
         name=name,
         p=min(1.0, p * len(places)),
         size_px=size,
-        share=_share(best, rw),
-        words=f"{words} at pose {problem.pose_id[k]}: {size:.2g} px rms",
-        at=problem.pose_id[k],
+        share=best / max(before, 1e-300),
+        words=f"{words} at pose {fit.problem.pose_id[k]} by ({', '.join(f'{x:.3f}' for x in step[-3:])}) mm: "
+        f"{size:.2g} px rms",
+        at=fit.problem.pose_id[k],
     )
 
 
-def repeats(problem: Problem, scale: float) -> tuple[dict[str, Any], ...]:
+def repeats(problem: Problem, scale: float) -> tuple[RepeatedPose, ...]:
     """The first pose against later images of the same pose: the check of closure."""
     same = (
         (np.linalg.norm(problem.t_MH - problem.t_MH[0], axis=1) < REPEATED_MM)
@@ -204,98 +202,91 @@ def repeats(problem: Problem, scale: float) -> tuple[dict[str, Any], ...]:
         dx = problem.x_D[k] - problem.x_D[0]
         V = (problem.covariance[k] + problem.covariance[0]) * scale
         result.append(
-            {
-                "first": problem.pose_id[0],
-                "again": problem.pose_id[k],
-                "distance_px": float(np.linalg.norm(dx)),
-                "sigmas": float(np.sqrt(dx @ np.linalg.solve(V, dx))),
-            }
+            RepeatedPose(
+                first=problem.pose_id[0],
+                again=problem.pose_id[k],
+                distance_px=float(np.linalg.norm(dx)),
+                sigmas=float(np.sqrt(dx @ np.linalg.solve(V, dx))),
+            )
         )
     return tuple(result)
 
 
-def blocked_cross_validation(
-    problem: Problem, free: FreeParameters, fit: Fit, blocks_: int = BLOCKS
-) -> tuple[float, float]:
-    """(rms px, mean squared error in predicted standard deviations) of poses predicted by a fit without their block.
+def outlier_block(pose_id: tuple[str, ...], keep: Any) -> OutlierBlock | None:
+    """The longest run of at least two neighbours set aside among n rows, keep (n,) bool; None where there is none.
 
-    The blocks are runs of neighbours in the sequence: what drifts or was set together is left out together.  nan where
-    leaving a block out leaves too little.
+    p bounds the probability that k outliers, thrown among n rows by chance, hold a run of that length L anywhere:
+    (n - L + 1) C(n - L, k - L) / C(n, k).
     """
-    n, m = len(problem), fit.N.shape[0]
-    edges = np.linspace(0, n, blocks_ + 1).astype(int)
-    squares, normalised = [], []
-    for a, b in itertools.pairwise(edges):
-        out = np.zeros(n, dtype=bool)
-        out[a:b] = True
-        if 2 * (~out).sum() <= m or len(np.unique(problem.ball[~out])) < len(problem.ball_ids):
-            return float("nan"), float("nan")
-        part = minimise(problem, free, fit, weight=(~out).astype(float), iterations=15)
-        held = problem.select(out)
-        at = blocks(held, free, part)
-        J = jacobian(held, free, at)
-        r = held.x_D - at.x_D
-        V = held.covariance + J @ inverse_information(part.N) @ np.swapaxes(J, 1, 2)
-        squares.append((r**2).sum(axis=1))
-        normalised.append(np.einsum("ki,ki->k", r, np.linalg.solve(V, r[:, :, None])[..., 0]) / 2)
-    return float(np.sqrt(np.concatenate(squares).mean())), float(np.concatenate(normalised).mean())
+    out = ~np.asarray(keep, dtype=bool)
+    n, k = len(out), int(out.sum())
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], out.astype(int), [0]])))
+    runs = edges.reshape(-1, 2)
+    if not len(runs):
+        return None
+    first, stop = (int(x) for x in runs[np.argmax(runs[:, 1] - runs[:, 0])])
+    length = stop - first
+    if length < 2:
+        return None
+    p = min(1.0, (n - length + 1) * comb(n - length, k - length) / comb(n, k))
+    return OutlierBlock(first=pose_id[first], last=pose_id[stop - 1], count=length, p=p)
 
 
-def movements(problem: Problem, free: FreeParameters, fit: Fit) -> tuple[Effect, ...]:
-    """Drifts and change points, significant or not."""
-    b = blocks(problem, free, fit)
-    J, r = jacobian(problem, free, b), problem.x_D - b.x_D
-    Jw, rw = problem.W @ J, (problem.W @ r[:, :, None])[..., 0]
+def movements_of(fit: LinearFit, R_HT: Array) -> tuple[Effect, ...]:
+    """Drifts and change points, significant or not.  R_HT (3, 3): rotation of the mount."""
+    W = fit.W
     found = [
-        drift(problem, Jw, rw, problem.W @ b.J_t_HT, name="drift", words="the ball drifts by {}", unit=(1000.0, "um")),
-        drift(
-            problem,
-            Jw,
-            rw,
-            problem.W,
-            name="image drift",
-            words="the images drift by {} (focal spot or detector)",
-            unit=(1.0, "px"),
-        ),
-        change_point(problem, Jw, rw, problem.W @ b.J_t, name="ball", words="the ball changed its place"),
-        change_point(
-            problem, Jw, rw, problem.W @ b.J_mount, name="mount", words="the mount changed (bumped or referenced anew)"
-        ),
+        drift(fit, W @ fit.J_t_HT, name="drift", words="the ball drifts by {}", unit=(1000.0, "um")),
+        drift(fit, W, name="image drift", words="the images drift by {} (focal spot or detector)", unit=(1.0, "px")),
+        *(change_point(fit, W @ J, name=name, words=words) for name, words, J in _steps(fit, R_HT)),
     ]
     return tuple(e for e in found if e is not None)
 
 
+def _steps(fit: LinearFit, R_HT: Array) -> tuple[tuple[str, str, Array], ...]:
+    """(name, words, columns (n, 2, c)) of what may change from one pose to the next.
+
+    A new pivot that is off by c shifts H against the base and M against the plate: t_HT += R_HT c, t -= c.
+    """
+    return (
+        ("ball", "the ball changed its place", fit.J_ball),
+        ("pivot", "the pivot of the controller changed", fit.J_t_HT @ R_HT - fit.J_ball),
+        ("mount", "the mount changed (bumped or referenced anew)", fit.J_mount),
+    )
+
+
+def movements(problem: Problem, free: FreeParameters, fit: Fit) -> tuple[Effect, ...]:
+    """Drifts and change points of a rigid fit."""
+    return movements_of(linear_fit(problem, free, fit), fit.R_HT)
+
+
 def chi2_with_movements(problem: Problem, free: FreeParameters, fit: Fit, moved: Iterable[Effect]) -> float:
-    """chi2 of a fit that may also follow such movements: images off by a cubic of time, the ball or the mount
-    elsewhere from the pose named on.  To first order; the priors' part stays."""
-    b = blocks(problem, free, fit)
-    Jw = (problem.W @ jacobian(problem, free, b)).reshape(2 * len(problem), -1)
-    rw = (problem.W @ (problem.x_D - b.x_D)[:, :, None])[..., 0].ravel()
+    """chi2 of a fit that may also follow such movements: images off by a cubic of time, the ball, the pivot or the
+    mount elsewhere from the pose named on.  To first order; the priors' part stays."""
+    at = linear_fit(problem, free, fit)
+    n = len(problem)
     tau = elapsed(problem) / max(float(elapsed(problem).max()), 1e-300)
-    columns = [Jw]
+    steps = {name: J for name, _, J in _steps(at, fit.R_HT)}
+    columns = [at.J_white.reshape(2 * n, -1)]
     for e in moved:
         if e.at:
-            late = np.arange(len(problem)) >= problem.pose_id.index(e.at)
-            J_step = (b.J_t if e.name == "ball" else b.J_mount) * late[:, None, None]
-            columns.append((problem.W @ J_step).reshape(len(rw), -1))
+            late = np.arange(n) >= problem.pose_id.index(e.at)
+            columns.append((at.W @ (steps[e.name] * late[:, None, None])).reshape(2 * n, -1))
         else:
-            columns += [(problem.W * (tau**k)[:, None, None]).reshape(len(rw), -1) for k in range(DRIFT_ORDER + 1)]
-    rest = _without(rw[:, None], np.concatenate(columns, axis=1))
+            columns += [(at.W * (tau**k)[:, None, None]).reshape(2 * n, -1) for k in range(DRIFT_ORDER + 1)]
+    rest = _without(at.r_white.reshape(-1, 1), np.concatenate(columns, axis=1))
     return float((rest**2).sum() + (free.information * fit.delta**2).sum())
 
 
-def _scale(rw: Array, m: int) -> float:
-    return max(1.0, float((rw**2).sum()) / max(rw.size - m, 1))
-
-
-def integrity(problem: Problem, free: FreeParameters, fit: Fit) -> Integrity:
-    """All checks on the rows that were used."""
-    r = residuals(problem, free, fit)
-    rms, normalised = blocked_cross_validation(problem, free, fit)
-    return Integrity(
-        effects=movements(problem, free, fit),
-        repeats=repeats(problem, _scale((problem.W @ r[:, :, None])[..., 0], fit.N.shape[0])),
-        held_out_rms=rms,
-        held_out_chi2=normalised,
-        fit_rms=float(np.sqrt((r**2).sum(axis=1).mean())),
+def stability(fit: LinearFit, R_HT: Array, everything: Problem, keep: Any) -> Stability:
+    """All checks of a fit, whatever its model.  everything, keep (n,) bool: all rows, and those that the fit used."""
+    left_out = held_out(fit)
+    d2 = (fit.r_white**2).sum()
+    return Stability(
+        effects=movements_of(fit, R_HT),
+        repeats=repeats(everything, max(1.0, float(d2) / max(fit.r.size - fit.J.shape[2], 1))),
+        held_out_rms=left_out.rms,
+        held_out_chi2=left_out.chi2,
+        fit_rms=float(np.sqrt((fit.r**2).sum(axis=1).mean())),
+        block=outlier_block(everything.pose_id, keep),
     )

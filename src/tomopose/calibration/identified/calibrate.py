@@ -13,24 +13,22 @@ from typing import Any
 
 import numpy as np
 
+from tomopose.calibration.checks.convention_tests import Diagnosis
 from tomopose.calibration.identified.fit import ModelFit, fit_model
 from tomopose.calibration.identified.geometry_prior import averaged
 from tomopose.calibration.identified.map_estimate import KinematicProblem, State
-from tomopose.calibration.identified.model_selection import EVIDENCE_GAIN, Judgement, better, judge
+from tomopose.calibration.identified.model_selection import EVIDENCE_GAIN, better, judged
 from tomopose.calibration.identified.pose_map import map_candidates
-from tomopose.calibration.identified.result import calibration_of, comparison, scatter_block
-from tomopose.calibration.identified.run_changes import change_in_words, find_change, require_same_pivot
+from tomopose.calibration.identified.result import calibration_of, comparison, scatter_of_fit
 from tomopose.calibration.identified.scale_bars import require_balls_not_swapped
-from tomopose.calibration.model.parameters import (
-    FreeParameters,
-    free_parameters,
-)
+from tomopose.calibration.model.parameters import FreeParameters, base_name, free_parameters
 from tomopose.calibration.model.problem import Problem, pair
-from tomopose.calibration.result import Calibration
+from tomopose.calibration.result import Calibration, ModelJudgement
 from tomopose.errors import InputError, NotConvergedError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.error_models import RigidErrors
 from tomopose.manipulator.files import hexapod_from_document, read_manipulator, serial_from_document
 from tomopose.manipulator.hexapod import Hexapod
 from tomopose.manipulator.inverse import InverseManipulator
@@ -40,6 +38,7 @@ from tomopose.manipulator.real_poses import ErrorModel, Repeatability
 from tomopose.manipulator.run_effects import with_run_effects
 from tomopose.manipulator.serial import SerialRobot
 from tomopose.observations import BallObservations
+from tomopose.provenance import provenance
 from tomopose.units import Array
 
 MODELS = ("auto", "rigid", "kinematic", "slack")
@@ -77,7 +76,7 @@ def calibrate_kinematic(
 
     Raises
     ------
-    InputError         a manipulator that does not fit, balls mixed up, a pivot that changed during the run.
+    InputError         a manipulator that does not fit, balls mixed up.
     OutOfReachError    poses that the platform cannot reach.
     TrajectoryError    singular poses.
     NotConvergedError  no optimum.
@@ -110,14 +109,30 @@ def calibrate_kinematic(
     if model == "slack":
         candidates += map_candidates(problem, start)
     fits = _fit_all(problem, start, candidates, robust, needed="kinematic" if model == "kinematic" else "rigid")
-    doubts = _sound_run(fits, problem)
-    judged = {name: judge(name, fit) for name, fit in fits.items()}
-    chosen = _choose(model, judged)
+    best = max(fits.values(), key=lambda f: f.estimate.log_evidence)
+    require_balls_not_swapped(best, problem)
+    found = {name: judged(name, fit) for name, fit in fits.items()}
+    chosen = _choose(model, found)
     if chosen == "rigid" and model == "auto" and not (problem.bars or problem.view_sigma):
-        block = {**rigid.manipulator, "scatter": scatter_block(fits["rigid"])}
-        return replace(rigid, manipulator=block, extra={**rigid.extra, **comparison(judged, fits, chosen)})
+        errors = RigidErrors(translation_scale=_scale_of(rigid), scatter=scatter_of_fit(fits["rigid"]))
+        return replace(rigid, errors=errors, comparison=comparison(found, fits, chosen))
     fits[chosen] = averaged(fits[chosen])
-    return calibration_of(rigid, fits, judged, chosen, model, data.pose_id, doubts)
+    earlier = {} if rigid.provenance is None else dict(rigid.provenance.arguments)
+    return calibration_of(
+        fits,
+        found,
+        chosen,
+        asked=model,
+        everything=data,
+        arrangement="moving-scanner" if problem.inverse else rigid.arrangement,
+        magnification_at_ball=rigid.magnification_at_ball,
+        diagnosis=Diagnosis(hypotheses=rigid.hypotheses) if rigid.hypotheses else None,
+        provenance=provenance(arguments={**earlier, "model": model}),
+    )
+
+
+def _scale_of(rigid: Calibration) -> float:
+    return rigid.errors.translation_scale if isinstance(rigid.errors, RigidErrors) else 1.0
 
 
 def machine_of(manipulator: Any) -> ErrorModel | None:
@@ -158,11 +173,10 @@ def pose_rows(data: Problem, poses: PoseSequence | Sequence[PoseSequence]) -> Po
 
 def _freed_as(rigid: Calibration, data: Problem) -> FreeParameters:
     """What the rigid calibration freed, with the same priors."""
-    known = 6 + 3 * len(rigid.balls)
-    names = {name.split("[")[0] for name in rigid.tangent[known:]}
-    arguments = {} if rigid.provenance is None else rigid.provenance.arguments
-    held = [name for name in data.scanner.sigma if name not in names]
-    return free_parameters(data.scanners, free=sorted(names), fix=held, priors=arguments.get("priors"))
+    priors = {base_name(name): sigma for name, sigma in rigid.priors.items()}
+    held = [name for name in data.scanner.sigma if name not in priors]
+    stated = {name: sigma for name, sigma in priors.items() if np.isfinite(sigma)}
+    return free_parameters(data.scanners, free=sorted(priors), fix=held, priors=stated)
 
 
 def _freed_values(rigid: Calibration, free: FreeParameters) -> Array:
@@ -197,7 +211,7 @@ def _fit_all(
     A candidate without an optimum is left out, unless it is the rigid one or the one `needed`.
     """
     fits: dict[str, ModelFit] = {}
-    keep = None
+    keep, misfit = None, False
     for name, machine in reversed(candidates):
         own, begin = replace(problem, model=machine), start
         if machine is not None:
@@ -205,9 +219,9 @@ def _fit_all(
         try:
             if keep is None:
                 fits[name] = _with_run_effects(own, fit_model(own, begin, robust=robust))
-                keep = fits[name].keep
+                keep, misfit = fits[name].keep, fits[name].misfit
             else:
-                fits[name] = fit_model(own, begin, keep=keep)
+                fits[name] = replace(fit_model(own, begin, keep=keep), misfit=misfit)
         except NotConvergedError:
             if name in ("rigid", needed):
                 raise
@@ -228,19 +242,12 @@ def _with_run_effects(problem: KinematicProblem, fit: ModelFit) -> ModelFit:
         other = fit_model(replace(problem, model=model), start, keep=fit.keep)
     except NotConvergedError:
         return fit
-    return replace(other, size=fit.size) if other.estimate.log_evidence > estimate.log_evidence + EVIDENCE_GAIN else fit
+    if other.estimate.log_evidence > estimate.log_evidence + EVIDENCE_GAIN:
+        return replace(other, size=fit.size, misfit=fit.misfit)
+    return fit
 
 
-def _sound_run(fits: Mapping[str, ModelFit], problem: KinematicProblem) -> tuple[str, ...]:
-    """Doubts about the run itself, judged with the model that fits best; InputError where it cannot be used."""
-    fit = max(fits.values(), key=lambda f: f.estimate.log_evidence)
-    require_balls_not_swapped(fit, problem)
-    change = find_change(fit)
-    require_same_pivot(fit, change)
-    return () if change is None else (change_in_words(fit, change),)
-
-
-def _choose(model: str, judged: Mapping[str, Judgement]) -> str:
+def _choose(model: str, judged: Mapping[str, ModelJudgement]) -> str:
     if model in ("kinematic", "rigid"):
         return model
     if model == "auto":

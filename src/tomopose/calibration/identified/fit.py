@@ -40,12 +40,14 @@ class ModelFit:
 
     keep (n,) bool: rows used, of all rows.  distance2 (n,): squared studentised residuals of all rows.
     size: largest factor on the stated standard deviations of the errors.
+    misfit: more rows fail than may be outliers, and none was set aside.
     """
 
     estimate: MapEstimate
     keep: Any
     distance2: Array
     size: float = 1.0
+    misfit: bool = False
 
     @property
     def scatter(self) -> float:
@@ -81,7 +83,7 @@ def solve_softened(problem: KinematicProblem, start: State) -> MapEstimate:
 def with_scatter(estimate: MapEstimate) -> MapEstimate:
     """The estimate with the plate's scatter raised until chi2 is what right covariances leave; never below the stated.
 
-    Scatter is raised only where chi2 lies above the value exceeded once in a hundred runs.
+    PoseScatter is raised only where chi2 lies above the value exceeded once in a hundred runs.
     """
     f, best = estimate.problem.scatter, estimate
     if best.dof <= 0 or not best.problem.repeatability.variance.any():
@@ -150,26 +152,30 @@ def fit_model(problem: KinematicProblem, start: State, *, robust: bool = True, k
     n = len(problem.poses)
     given = keep is not None
     keep = np.asarray(keep) if given else np.ones(n, dtype=bool)
+    misfit = False
     if robust and not given:
-        estimate, keep = _robust(problem, start)
+        estimate, keep, misfit = _robust(problem, start)
     else:
         estimate = solve_softened(problem if keep.all() else problem.rows(keep), start)
-    estimate = with_scatter(estimate)
-    estimate, size = with_size(estimate)
-    if size > 1.0 and estimate.problem.scatter > 1.0:
-        # what looked like scatter may have been errors larger than stated
-        quiet = with_scatter(solve_softened(replace(estimate.problem, scatter=1.0), estimate.state))
-        estimate = max(estimate, quiet, key=lambda e: e.log_evidence)
+    scattered = with_scatter(estimate)
+    estimate, size = with_size(scattered)
+    if estimate is not scattered:
+        # scatter found beside errors of another size is another: what looked like scatter may have been larger errors
+        estimate = with_scatter(estimate)
+        if size > 1.0 and estimate.problem.scatter > 1.0:
+            quiet = with_scatter(solve_softened(replace(estimate.problem, scatter=1.0), estimate.state))
+            estimate = max(estimate, quiet, key=lambda e: e.log_evidence)
     whole = replace(problem, scatter=estimate.problem.scatter, model=estimate.problem.model)
-    return ModelFit(estimate=estimate, keep=keep, distance2=distances(estimate, whole, keep), size=size)
+    return ModelFit(estimate=estimate, keep=keep, distance2=distances(estimate, whole, keep), size=size, misfit=misfit)
 
 
 def _scale(d2: Array) -> float:
     return float(np.median(d2) / MEDIAN_CHI2_2)
 
 
-def _robust(problem: KinematicProblem, start: State) -> tuple[MapEstimate, Any]:
-    """The fit of the rows that belong, and which; of all rows where no few outliers explain the misfit."""
+def _robust(problem: KinematicProblem, start: State) -> tuple[MapEstimate, Any, bool]:
+    """(fit of the rows that belong, which, False), or (fit of all, all, True) where no few outliers explain the
+    misfit."""
     n = len(problem.poses)
     everything = np.ones(n, dtype=bool)
     d = np.linalg.norm(linearise(problem, start).r, axis=1)
@@ -180,7 +186,7 @@ def _robust(problem: KinematicProblem, start: State) -> tuple[MapEstimate, Any]:
     softened = replace(problem, scatter=estimate.problem.scatter)
     d2 = distances(estimate, softened, keep)
     if d2.max() <= limit(n) * max(1.0, _scale(d2)):
-        return (estimate if keep.all() else solve_map(softened, estimate.state)), everything
+        return (estimate if keep.all() else solve_map(softened, estimate.state)), everything, False
     state = estimate.state
     weight = _weights(d2)
     for _ in range(REWEIGHTINGS):
@@ -201,9 +207,9 @@ def _robust(problem: KinematicProblem, start: State) -> tuple[MapEstimate, Any]:
         d2 = distances(estimate, softened, keep)
         new_keep = d2 <= limit(n) * max(1.0, _scale(d2[keep]))
         if (new_keep == keep).all():
-            return estimate, keep
+            return estimate, keep, False
         keep, state = new_keep, estimate.state
-    return solve_softened(problem, start), everything
+    return solve_softened(problem, start), everything, True
 
 
 def _weights(d2: Array) -> Array:

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks, whiteners
+from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, translation_scale
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.model.twin_projection import twin_blocks
@@ -303,6 +304,22 @@ def _estimate(problem: KinematicProblem, state: State, r: Array, J: Array, at: L
         dof=len(r) - J.shape[1],
         log_evidence=-0.5 * (chi2 + log_det_C + 2 * float(np.sum(np.log(held))) + log_det),
         steps=steps,
+    )
+
+
+def linear_fit(estimate: MapEstimate) -> LinearFit:
+    """The estimate as the checks look at it: centres, and priors and bars as rows of their own."""
+    r, J, at, W = _weighted(estimate.problem, estimate.state)
+    k = at.r.size
+    return LinearFit(
+        problem=estimate.problem.data,
+        r=at.r,
+        J=at.J,
+        C=at.C,
+        W=W,
+        prior_rows=J[k:],
+        prior_residuals=r[k:],
+        information=J.T @ J,
     )
 
 

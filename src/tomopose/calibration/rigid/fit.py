@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from tomopose.calibration.model.ball_projection import ProjectionBlocks, projection_blocks
+from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, translation_scale
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.rigid.kernel import CONVERGED, centres, levenberg_marquardt
@@ -125,6 +126,26 @@ def jacobian(problem: Problem, free: FreeParameters, b: ProjectionBlocks) -> Arr
     J_free: Any = b.J_scanner[:, :, free.cols] * free.factor
     mine = (free.col_run[None, :] < 0) | (free.col_run[None, :] == problem.run[:, None])
     return np.concatenate([b.J_mount, J_balls, J_free * mine[:, None, :]], axis=2)
+
+
+def linear_fit(problem: Problem, free: FreeParameters, fit: Fit) -> LinearFit:
+    """The fit with its residuals, derivatives and priors, as the checks look at it."""
+    b = blocks(problem, free, fit)
+    J = jacobian(problem, free, b)
+    m, stated = J.shape[2], np.flatnonzero(free.information > 0)
+    root = np.sqrt(free.information[stated])
+    rows = np.zeros((len(stated), m))
+    rows[np.arange(len(stated)), m - len(free) + stated] = root
+    return LinearFit(
+        problem=problem,
+        r=problem.x_D - b.x_D,
+        J=J,
+        C=problem.covariance,
+        W=problem.W,
+        prior_rows=rows,
+        prior_residuals=-root * fit.delta[stated],
+        information=fit.N,
+    )
 
 
 def tangent_names(ball_ids: tuple[int, ...], free: FreeParameters) -> tuple[str, ...]:

@@ -6,11 +6,12 @@ A direction counts as unobservable where its predicted standard uncertainty exce
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from tomopose.calibration.model.parameters import MATTERS, FreeParameters, base_name, unit_of
 from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.result import Observability
 from tomopose.calibration.rigid.fit import tangent_names
 from tomopose.units import Array
 
@@ -26,6 +27,21 @@ deviations) plays no part."""
 
 SHOWN = 0.25
 """A direction's words name the coordinates with at least this part of its largest component."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observability:
+    """What the poses can determine.  singular_values of the scaled Jacobian, largest first; unobservable: directions,
+    in words; notes: what would help."""
+
+    singular_values: Array
+    unobservable: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def condition(self) -> float:
+        s = np.asarray(self.singular_values)
+        return float(s[0] / s[-1]) if s.size and s[-1] > 0 else float("inf")
 
 
 def scales(names: tuple[str, ...]) -> Array:

@@ -145,20 +145,14 @@ def monte_carlo(
         converged=True,
         N=np.zeros((0, 0)),
     )
-    found = calibration.extra.get("pose_noise")
-    noise = (
-        None
-        if found is None
-        else PoseNoise(translation=float(found["translation_mm"]), rotation=float(found["rotation_rad"]))
-    )
+    found = calibration.pose_noise
+    noise = None if found is None else PoseNoise(translation=found.translation_mm, rotation=found.rotation_rad)
     return draw(problem, free, truth, draws, seed=seed, noise=noise)
 
 
 def _free_of(calibration: Calibration, problem: Problem) -> FreeParameters:
     """What the calibration had freed, with the same priors."""
-    known = 6 + 3 * len(calibration.balls)
-    names = {base_name(n) for n in calibration.tangent[known:]}
-    arguments = {} if calibration.provenance is None else calibration.provenance.arguments
-    held = [n for n in problem.scanner.sigma if n not in names]
-    priors = {k: v for k, v in dict(arguments.get("priors", {})).items() if k in names}
-    return free_parameters(problem.scanners, free=sorted(names), fix=held, priors=priors)
+    priors = {base_name(name): sigma for name, sigma in calibration.priors.items()}
+    held = [name for name in problem.scanner.sigma if name not in priors]
+    stated = {name: sigma for name, sigma in priors.items() if np.isfinite(sigma)}
+    return free_parameters(problem.scanners, free=sorted(priors), fix=held, priors=stated)

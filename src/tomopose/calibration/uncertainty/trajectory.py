@@ -13,7 +13,7 @@ import numpy as np
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.result import Calibration
 from tomopose.geometry.rotations import exp_rotation, skew
-from tomopose.manipulator.error_models import correction, moving_scanner
+from tomopose.manipulator.error_models import correction
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.units import Array
 
@@ -74,7 +74,7 @@ def trajectory_jacobian(calibration: Calibration, poses: PoseSequence, points: A
     mm, in H.  `poses` are the commanded ones; identified errors of the manipulator are applied here.
     """
     scanner, names, R_HT = calibration.scanner, calibration.tangent, calibration.T_HT.R
-    fixed = correction(calibration.manipulator, poses)
+    fixed = correction(calibration.errors, poses)
     T_MH = fixed.poses.T_MH
     x = np.asarray(points, dtype=np.float64)
     x_M = (scanner.T_TW(0.0).inv.apply(x) - calibration.T_HT.t) @ R_HT
@@ -101,27 +101,18 @@ def trajectory_jacobian(calibration: Calibration, poses: PoseSequence, points: A
     return flat.reshape(J.shape), J_pose
 
 
-def scatter_of(calibration: Calibration) -> Array:
-    """(6,) variance of (w, t) of the plate from pose to pose, rad^2 and mm^2; 0 where it is not known."""
-    found = calibration.manipulator.get("scatter")
-    if found is not None:
-        return np.concatenate([np.broadcast_to(np.asarray(found[name]) ** 2, 3) for name in ("w_rad", "t_mm")])
-    noise = calibration.extra.get("pose_noise", {"rotation_rad": 0.0, "translation_mm": 0.0})
-    return np.repeat([float(noise["rotation_rad"]) ** 2, float(noise["translation_mm"]) ** 2], 3)
-
-
 def scatter_variance(calibration: Calibration, poses: PoseSequence, x_M: Any) -> Array:
     """(n, m, 2) px^2: what the plate's scatter from pose to pose adds to points x_M (m, 3) of the object, and that of
     scanner parameters from view to view.
 
     poses: where the plate stands (corrected).
     """
-    variance, T_MH, block = scatter_of(calibration), poses.T_MH, calibration.manipulator
-    views = {SCANNER_COLUMNS.index(name): float(sigma) for name, sigma in block.get("view_sigma", {}).items()}
+    scatter, T_MH = calibration.errors.scatter, poses.T_MH
+    variance = np.zeros(6) if scatter is None else scatter.variance
+    views = {} if calibration.views is None else {SCANNER_COLUMNS.index("d_SD"): calibration.views.sigma}
     V = np.zeros((len(poses), len(x_M), 2))
     if variance.any() or views:
-        # the scatter that the poses' residuals alone give (pose_noise) turns about the plate's origin in the table
-        about_H = "scatter" in block and moving_scanner(block)
+        about_H = scatter is not None and scatter.about_H
         for i, x in enumerate(np.asarray(x_M, dtype=np.float64)):
             b = projection_blocks(calibration.scanner, T_HT=calibration.T_HT, T_MH=T_MH, t=x, alpha=poses.alpha)
             lever = b.x_H if about_H else b.x_H - T_MH.t
@@ -142,5 +133,5 @@ def trajectory_sigma(calibration: Calibration, poses: PoseSequence, points: Any,
     if scatter:
         x_W = np.asarray(points, dtype=np.float64)
         x_M = (calibration.scanner.T_TW(0.0).inv.apply(x_W) - calibration.T_HT.t) @ calibration.T_HT.R
-        V = V + scatter_variance(calibration, correction(calibration.manipulator, poses).poses, x_M)
+        V = V + scatter_variance(calibration, correction(calibration.errors, poses).poses, x_M)
     return np.sqrt(np.maximum(V, 0.0))

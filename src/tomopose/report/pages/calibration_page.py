@@ -28,7 +28,7 @@ from tomopose.report.page import (
     Words,
     render,
 )
-from tomopose.report.pages.checks_section import checks_section
+from tomopose.report.pages.checks_section import checks_section, findings_table
 from tomopose.report.pages.history_page import history_section
 from tomopose.report.pages.observability_section import observability_section
 from tomopose.report.pages.parameters_section import parameters_section
@@ -76,6 +76,7 @@ def calibration_report(
     """
     n, left = len(calibration.pose_id), len(set_aside(calibration))
     sections = [
+        *findings_table(calibration),
         parameters_section(calibration),
         *_data_sections(calibration, observations=observations, poses=poses, thumbnails=thumbnails, scan=scan),
         *(section for section in (checks_section(calibration), history_section(history)) if section is not None),
@@ -133,7 +134,7 @@ def _key_figures(calibration: Calibration, scan: ProjectionMatrices | None) -> l
     d_px, d_um = (calibration.d_rms, calibration.d_rms_um) if calibration.pose_id else (np.nan, np.nan)
     keys = [
         KeyFigure(name="Reprojection error d_rms", value=with_unit(d_px, "px"), note="eq. (8)"),
-        KeyFigure(name="… at the object", value=with_unit(d_um, "µm"), note="pitch over magnification"),
+        KeyFigure(name="… at the object", value=with_unit(d_um, "µm"), note="pitch over the magnification at the ball"),
         KeyFigure(
             name="χ² per degree of freedom",
             value=number(chi2) if np.isfinite(chi2) else NOT_DETERMINABLE,
@@ -216,8 +217,7 @@ def _detections(
 
 def set_aside(calibration: Calibration) -> dict[str, str]:
     """Poses that do not take part, with the reason: no ball measured, or an outlier of the fit."""
-    not_seen = calibration.extra.get("not_seen")
-    return {**(not_seen if isinstance(not_seen, Mapping) else {}), **calibration.outliers}
+    return {**calibration.not_seen, **calibration.outliers}
 
 
 def _pose_table(joined: Joined, observations: BallObservations | None) -> Table:

@@ -1,58 +1,54 @@
-"""Models compared, poses held out, drift and steps: what a calibration found out about itself (`Calibration.extra`)."""
+"""Findings, models compared, poses held out, drift and steps: what a calibration found out about itself."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.result import Calibration
+from tomopose.calibration.checks.stability import Stability
+from tomopose.calibration.result import Calibration, ModelComparison, RotationResiduals
+from tomopose.geometry.scanner import PARAMETER_UNITS
 from tomopose.report.page import Block, Figure, Section, Table, Words
 from tomopose.report.style import ACCENT, ORANGE, SOFT, axis, layout
-from tomopose.report.words import cell, heading, number
+from tomopose.report.words import cell, number
 
 MODEL_COLOURS: Mapping[str, str] = MappingProxyType({"rigid": "#9dbfdd", "kinematic": ACCENT, "slack": ORANGE})
-MODEL_HEADINGS: Mapping[str, str] = MappingProxyType(
-    {
-        "model": "model",
-        "d_rms_px": "d_rms / px",
-        "cv_rms_px": "held-out poses / px",
-        "chi2_dof": "χ²/dof",
-        "log_evidence": "log evidence",
-        "log_predictive": "log predictive",
-    }
-)
-KNOWN = (
-    "integrity",
-    "models",
-    "model_chosen",
-    "by_rotation",
-    "pose_noise",
-    "widening",
-    "expected_residual_px",
-    "not_seen",
-)
+
+
+def findings_table(calibration: Calibration) -> list[Section]:
+    """Everything that the rules found, with what it was compared with and what to do; none where nothing was found."""
+    if not calibration.checks:
+        return []
+    table = Table(
+        title="What the checks found",
+        meaning="Each rule compares a value with its limit. The worst finding is the verdict.",
+        columns=["rule", "finding", "value", "limit", "what to do", "verdict"],
+        rows=[[f.rule, f.words, cell(f.value), cell(f.limit), f.remedy or "–", f.verdict] for f in calibration.checks],
+        numeric=(2, 3),
+    )
+    return [
+        Section(
+            title="Findings", lead="What speaks against this calibration, and what is worth knowing.", blocks=[table]
+        )
+    ]
 
 
 def checks_section(calibration: Calibration) -> Section | None:
-    """The section, or None where the calibration holds no such results.
-
-    What this page does not know is shown too, as plain tables.
-    """
-    extra = calibration.extra
+    """The section, or None where the calibration holds no such results."""
     blocks: list[Block] = []
-    if isinstance(extra.get("models"), Sequence):
-        blocks.append(_models(extra["models"], str(extra.get("model_chosen", calibration.model))))
-    if isinstance(extra.get("by_rotation"), Sequence) and extra["by_rotation"]:
-        blocks.append(models_by_rotation(extra["by_rotation"]))
-    if isinstance(extra.get("integrity"), Mapping):
-        blocks += _integrity(extra["integrity"])
-    words = list(_noise_words(extra))
+    compared = calibration.comparison
+    if compared is not None:
+        blocks.append(_models(compared))
+        if compared.by_rotation:
+            blocks.append(models_by_rotation(compared.by_rotation))
+    if calibration.stability is not None:
+        blocks += _stability(calibration.stability)
+    words = list(_noise_words(calibration))
     if words:
         blocks.append(Words(title="Noise", items=words))
-    blocks += [t for key, value in extra.items() if key not in KNOWN and (t := _plain(key, value)) is not None]
+    blocks += _runs(calibration)
     if not blocks:
         return None
     return Section(
@@ -62,26 +58,28 @@ def checks_section(calibration: Calibration) -> Section | None:
     )
 
 
-def _models(models: Sequence[Mapping[str, Any]], chosen: str) -> Table:
-    columns = [c for c in MODEL_HEADINGS if any(c in m for m in models)]
-    rows = []
-    for m in models:
-        row = [cell(m.get(c)) for c in columns]
-        rows.append([*row, "chosen" if m.get("model") == chosen else ""])
+def _models(compared: ModelComparison) -> Table:
     return Table(
         title="Models compared",
         meaning="Held-out poses were predicted without having been fitted: a model that only fits better is not "
         "better. Evidence weighs fit against the number of parameters.",
-        columns=[*(MODEL_HEADINGS[c] for c in columns), ""],
-        rows=rows,
-        numeric=range(1, len(columns)),
+        columns=["model", "d_rms / px", "held-out poses / px", "χ²/dof", "log evidence", "log predictive", ""],
+        rows=[
+            [
+                m.model,
+                *(cell(v) for v in (m.d_rms, m.cv_rms, m.chi2_dof, m.log_evidence, m.log_predictive)),
+                "chosen" if m.model == compared.chosen else "",
+            ]
+            for m in compared.models
+        ],
+        numeric=range(1, 6),
     )
 
 
-def models_by_rotation(rows: Sequence[Mapping[str, Any]]) -> Figure:
+def models_by_rotation(rows: Sequence[RotationResiduals]) -> Figure:
     """rms residual of each model by rotation axis: fig. 8 (b) before and after the manipulator's own errors."""
-    names = [key.removesuffix("_px") for key in rows[0] if key.endswith("_px")]
-    rotations = [str(r["rotation"]).replace("-", "−") for r in rows]
+    names = list(rows[0].px)
+    rotations = [r.rotation.replace("-", "−") for r in rows]
     return Figure(
         title="Residuals by rotation, model by model",
         meaning="rms distance between detected and calculated centre for the poses of each rotation axis.",
@@ -91,7 +89,7 @@ def models_by_rotation(rows: Sequence[Mapping[str, Any]]) -> Figure:
                 "type": "bar",
                 "name": name,
                 "x": rotations,
-                "y": [row.get(f"{name}_px") for row in rows],
+                "y": [row.px.get(name) for row in rows],
                 "marker": {"color": MODEL_COLOURS.get(name, SOFT)},
                 "hovertemplate": f"{name}, rotation %{{x}}: %{{y:.4f}} px<extra></extra>",
             }
@@ -107,95 +105,89 @@ def models_by_rotation(rows: Sequence[Mapping[str, Any]]) -> Figure:
     )
 
 
-def _integrity(found: Mapping[str, Any]) -> list[Block]:
+def _stability(found: Stability) -> list[Block]:
     blocks: list[Block] = []
-    held, fit, chi2 = (found.get(k) for k in ("held_out_rms_px", "fit_rms_px", "held_out_chi2"))
-    if held is not None and fit is not None:
-        sentence = f"Poses left out of the fit are predicted to {number(held)} px rms; the fit leaves {number(fit)} px."
-        if chi2 is not None:
-            sentence += f" In units of the predicted uncertainty the square of the miss is {number(chi2)} (1 is right)."
+    if np.isfinite(found.held_out_rms):
+        sentence = (
+            f"Poses left out of the fit are predicted to {number(found.held_out_rms)} px rms; the fit leaves "
+            f"{number(found.fit_rms)} px. In units of the predicted uncertainty the square of the miss is "
+            f"{number(found.held_out_chi2)} (1 is right)."
+        )
         blocks.append(Words(title="Held-out poses", paragraphs=[sentence]))
-    effects = found.get("effects") or ()
-    if effects:
+    if found.effects:
         blocks.append(
             Table(
                 title="Did everything stand still?",
                 meaning="Drift and steps, with the probability that chance alone makes one as large.",
                 columns=["effect", "what it would be", "size / px", "probability by chance", "at pose"],
-                rows=[
-                    [
-                        e.get("name", ""),
-                        e.get("words", ""),
-                        cell(e.get("size_px")),
-                        probability(e.get("p")),
-                        e.get("at") or "–",
-                    ]
-                    for e in effects
-                ],
+                rows=[[e.name, e.words, cell(e.size_px), probability(e.p), e.at or "–"] for e in found.effects],
                 numeric=(2, 3),
             )
         )
-    repeats = found.get("repeats") or ()
-    if repeats:
-        columns = list(dict.fromkeys(key for row in repeats for key in row))
+    if found.repeats:
         blocks.append(
             Table(
                 title="Poses taken twice",
                 meaning="How far the ball's centre came back to where it had been.",
-                columns=[heading(c) for c in columns],
-                rows=[[cell(r.get(c)) for c in columns] for r in repeats],
-                folded=len(repeats) > 12,
+                columns=["first", "again", "distance / px", "sigmas"],
+                rows=[[r.first, r.again, cell(r.distance_px), cell(r.sigmas)] for r in found.repeats],
+                folded=len(found.repeats) > 12,
             )
         )
     return blocks
 
 
-def probability(p: Any) -> str:
-    if p is None or not np.isfinite(p):
+def probability(p: float) -> str:
+    if not np.isfinite(p):
         return "–"
     return "below 0.0001" if p < 1e-4 else f"{p:.4f}" if p < 0.1 else f"{p:.2f}"
 
 
-def _noise_words(extra: Mapping[str, Any]) -> list[str]:
+def _noise_words(calibration: Calibration) -> list[str]:
     words = []
-    if extra.get("expected_residual_px") is not None:
-        words.append(f"The stated uncertainties explain a residual of {number(extra['expected_residual_px'])} px.")
-    if extra.get("widening") not in (None, 1, 1.0):
+    if np.isfinite(calibration.expected_residual):
+        words.append(f"The stated uncertainties explain a residual of {number(calibration.expected_residual)} px.")
+    if calibration.widening != 1.0:
         words.append(
-            f"All uncertainties were widened by the factor {number(np.sqrt(extra['widening']))}, since the residuals "
-            "are larger than the stated noise."
+            f"All uncertainties were widened by the factor {number(np.sqrt(calibration.widening))}, since the "
+            "residuals are larger than the stated noise."
         )
-    noise = extra.get("pose_noise")
-    if isinstance(noise, Mapping):
+    noise = calibration.pose_noise
+    if noise is not None:
         words.append(
-            f"Pose noise was found beside detection noise: {number(noise['translation_mm'] * 1e3)} µm and "
-            f"{number(noise['rotation_rad'] * 1e6)} µrad; χ²/dof falls from {number(noise['chi2_dof_without'])} to "
-            f"{number(noise['chi2_dof_with'])}."
+            f"Pose noise was found beside detection noise: {number(noise.translation_mm * 1e3)} µm and "
+            f"{number(noise.rotation_rad * 1e6)} µrad; χ²/dof falls from {number(noise.chi2_dof_without)} to "
+            f"{number(noise.chi2_dof_with)}."
         )
     return words
 
 
-def _plain(key: str, value: Any) -> Table | None:
-    """A result that has no place of its own."""
-    rows = rows_of(value)
-    if not rows:
-        return None
-    columns = list(dict.fromkeys(c for row in rows for c in row))
-    return Table(
-        title=heading(key).capitalize(),
-        meaning="",
-        columns=[heading(c) for c in columns],
-        rows=[[cell(row.get(c)) for c in columns] for row in rows],
-        folded=len(rows) > 20,
-    )
-
-
-def rows_of(value: Any) -> list[Mapping[str, Any]]:
-    """A nested value as the rows of a table."""
-    if isinstance(value, Mapping):
-        if value and all(isinstance(v, Mapping) for v in value.values()):
-            return [{"name": k, **v} for k, v in value.items()]
-        return [{"name": heading(str(k)), "value": v} for k, v in value.items()]
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [v if isinstance(v, Mapping) else {"value": v} for v in value]
-    return [{"value": value}]
+def _runs(calibration: Calibration) -> list[Block]:
+    """The scanner of each run, and d_SD of each view, where there are several."""
+    blocks: list[Block] = []
+    if calibration.runs:
+        names = list(PARAMETER_UNITS)
+        blocks.append(
+            Table(
+                title="Scanner of each run",
+                meaning="The runs share the mount and the balls.",
+                columns=["run", *(f"{name} / {unit}" for name, unit in PARAMETER_UNITS.items())],
+                rows=[[str(k), *(cell(getattr(s, n)) for n in names)] for k, s in enumerate(calibration.runs)],
+                numeric=range(1, 1 + len(names)),
+            )
+        )
+    views = calibration.views
+    if views is not None:
+        blocks.append(
+            Table(
+                title="Source to detector, view by view",
+                meaning=f"d_SD scatters by {number(views.sigma)} mm from view to view.",
+                columns=["pose", "d_SD / mm", "u / mm"],
+                rows=[
+                    [pose, f"{d:.4f}", cell(u)] for pose, d, u in zip(views.pose_id, views.d_SD, views.u, strict=True)
+                ],
+                numeric=(1, 2),
+                folded=len(views.pose_id) > 20,
+            )
+        )
+    return blocks

@@ -6,23 +6,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tomopose.calibration.result import Calibration, Parameter
+from tomopose.calibration.result import Assumed, Calibration, Parameter
 from tomopose.coverage import expanded_k2
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.manipulator.error_models import moving_scanner
+from tomopose.manipulator.error_models import RigidErrors, TwinErrors
 from tomopose.report.page import Block, Section, Table, Words
-from tomopose.report.words import NOT_GIVEN, cell, heading, meaning, small_unit
+from tomopose.report.words import NOT_GIVEN, cell, meaning, small_unit
 from tomopose.units import value_with_uncertainty
 
 MANY_PARAMETERS = 12
-MACHINE_LISTS = ("names", "values", "units", "u", "nominal")
-"""Parts of `Calibration.manipulator` that stand in the tables of parameters already, or in its input file."""
 
 
 def parameters_section(calibration: Calibration) -> Section:
     """Values with uncertainty and units, both directions of the mount, the manipulator's errors, the pivot."""
-    names = calibration.manipulator.get("names")
-    machine = set(names) if isinstance(names, (list, tuple)) else set()
+    errors_found = calibration.errors
+    machine = set() if isinstance(errors_found, RigidErrors) else set(errors_found.names)
     T_HT = calibration.T_HT
     blocks: list[Block] = [
         _parameter_table(
@@ -44,9 +42,11 @@ def parameters_section(calibration: Calibration) -> Section:
                 "that the poses cannot tell stay near zero with the uncertainty of their prior.",
             )
         )
-    facts = [[heading(k), cell(v)] for k, v in calibration.manipulator.items() if k not in MACHINE_LISTS]
+    facts = _facts(calibration)
     if facts:
         blocks.append(Table(title="The manipulator's model", meaning="", columns=["", ""], rows=facts))
+    if calibration.assumed:
+        blocks.append(_assumed_table(calibration.assumed))
     pivot = NOT_GIVEN if calibration.pivot is None else ", ".join(f"{x:.4f}" for x in calibration.pivot) + " mm"
     blocks.append(
         Words(
@@ -56,13 +56,44 @@ def parameters_section(calibration: Calibration) -> Section:
             ]
         )
     )
-    carried = moving_scanner(calibration.manipulator) or calibration.manipulator.get("kind") == "twin"
     lead = (
         "How the scanner sits on the moved plate, and where the ball stands."
-        if carried
+        if calibration.inverse
         else "How the manipulator sits on the table, and where the ball is."
     )
     return Section(title="What was found", lead=lead, blocks=blocks)
+
+
+def _facts(calibration: Calibration) -> list[list[str]]:
+    """What is known of the manipulator beside the errors themselves."""
+    errors = calibration.errors
+    facts = [["arrangement", calibration.arrangement]] if calibration.inverse else []
+    if isinstance(errors, TwinErrors):
+        facts.append(["model", "twin robots"])
+    else:
+        if not isinstance(errors, RigidErrors):
+            facts.append(["model", errors.machine.kind])
+            if errors.lag is not None:
+                facts += [
+                    [name, f"{value:.4g} mm"] for name, value in zip(errors.lag.names, errors.lag.values, strict=True)
+                ]
+        if errors.translation_scale != 1.0:
+            facts.append(["scale of the translations", f"{errors.translation_scale:.9g}"])
+    if errors.scatter is not None:
+        t = ", ".join(f"{1e3 * x:.3g}" for x in errors.scatter.t)
+        w = ", ".join(f"{1e6 * x:.3g}" for x in errors.scatter.w)
+        facts.append(["scatter from pose to pose along x, y, z", f"{t} µm; {w} µrad"])
+    return facts
+
+
+def _assumed_table(assumed: Sequence[Assumed]) -> Table:
+    return Table(
+        title="What was assumed",
+        meaning="Taken with a standard uncertainty rather than measured here; it is part of every uncertainty above.",
+        columns=["parameter", "what it is", "standard uncertainty", "from"],
+        rows=[[a.name, meaning(a.name), f"{cell(a.sigma)} {a.unit}".strip(), a.source] for a in assumed],
+        numeric=(2,),
+    )
 
 
 def _parameter_table(parameters: Sequence[Parameter], *, title: str, words: str) -> Table:

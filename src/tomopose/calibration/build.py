@@ -1,0 +1,236 @@
+"""From a fit of any model to a `Calibration`: parameters, outliers, evidence, findings.  There is no other builder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from tomopose.calibration.checks.convention_tests import Diagnosis
+from tomopose.calibration.checks.rules import AgainstRigid, Evidence, ScatterFound, findings
+from tomopose.calibration.checks.stability import stability
+from tomopose.calibration.checks.verdict import Finding
+from tomopose.calibration.model.covariance import angles_by_tangent
+from tomopose.calibration.model.linear_fit import LinearFit
+from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, base_name, unit_of
+from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.result import (
+    Arrangement,
+    Assumed,
+    Calibration,
+    ModelComparison,
+    Parameter,
+    PoseNoiseFound,
+    ViewDistances,
+)
+from tomopose.calibration.rigid.fit import tangent_names
+from tomopose.calibration.rigid.observability import Observability
+from tomopose.calibration.uncertainty.tilted_scan import tilted_scan_sigma
+from tomopose.geometry.rotations import angles_from_rotation
+from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
+from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.error_models import Errors
+from tomopose.provenance import Provenance
+from tomopose.units import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class ManipulatorEvidence:
+    """What only models with the manipulator's errors have; as in `rules.Evidence`."""
+
+    scatter: ScatterFound | None = None
+    against_rigid: AgainstRigid | None = None
+    size: float | None = None
+    run_effects: bool = False
+    open_turns: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fitted:
+    """A fit of any model.
+
+    everything, keep, distance2: all rows, (n,) bool those used, (n,) their squared studentised residuals.
+    linear:       the fit of the rows used, linearised.
+    free, delta:  freed scanner parameters and their deviations;  p, p_names, p_units: (k,) the manipulator's errors.
+    covariance:   (m, m), widened by the factor `widening`;  widens: whether this model's covariance grows with chi2.
+    chi2, dof:    of the result;  fit_chi2: with the covariances that the fit used.
+    misfit:       more rows fail than may be outliers.
+    expected_px, stated_px: d_rms that the covariances in use and the stated ones explain.
+    magnification_at_ball: mean of d_SD over the ball's distance.
+    """
+
+    everything: Problem
+    keep: Any
+    distance2: Array
+    linear: LinearFit
+    T_HT: RigidTransform
+    balls: Array
+    free: FreeParameters
+    delta: Array
+    p: Array
+    p_names: tuple[str, ...]
+    p_units: tuple[str, ...]
+    covariance: Array
+    widening: float
+    widens: bool
+    chi2: float
+    fit_chi2: float
+    dof: int
+    converged: bool
+    status: str
+    misfit: bool
+    expected_px: float
+    stated_px: float
+    model: str
+    arrangement: Arrangement
+    errors: Errors
+    observability: Observability
+    manipulator: ManipulatorEvidence = ManipulatorEvidence()
+    diagnosis: Diagnosis | None = None
+    comparison: ModelComparison | None = None
+    pose_noise: PoseNoiseFound | None = None
+    views: ViewDistances | None = None
+    magnification_at_ball: float | None = None
+    provenance: Provenance | None = None
+
+
+def build(f: Fitted) -> Calibration:
+    """The calibration of a fit, with every check that applies to its model and arrangement."""
+    used = f.linear.problem
+    scanners = adjusted_scanners(used.scanners, f.free, f.delta)
+    result = Calibration(
+        scanner=scanners[0],
+        T_HT=f.T_HT,
+        balls=dict(zip(used.ball_ids, f.balls, strict=True)),
+        tangent=(*tangent_names(used.ball_ids, f.free), *f.p_names),
+        covariance=f.covariance,
+        pose_id=used.pose_id,
+        x_D=used.x_D,
+        residuals=f.linear.r,
+        chi2=f.chi2,
+        dof=f.dof,
+        parameters=parameter_list(f),
+        observability=f.observability,
+        outliers=_outliers(f),
+        not_seen=used.not_seen,
+        model=f.model,
+        arrangement=f.arrangement,
+        errors=f.errors,
+        priors=dict(zip(f.free.names, (float(s) for s in f.free.sigma), strict=True)),
+        assumed=assumed_of(used.scanners[0], f.free),
+        converged=f.converged,
+        status=f.status,
+        hypotheses=f.diagnosis.hypotheses if f.diagnosis else (),
+        comparison=f.comparison,
+        pose_noise=f.pose_noise,
+        views=f.views,
+        widening=f.widening,
+        expected_residual=f.expected_px,
+        magnification_at_ball=f.magnification_at_ball,
+        runs=scanners if len(scanners) > 1 else (),
+        pivot=used.pivot,
+        convention=used.convention,
+        provenance=f.provenance,
+    )
+    result = replace(result, stability=stability(f.linear, f.T_HT.R, f.everything, f.keep))
+    return replace(result, checks=findings(evidence_of(f, result)))
+
+
+def evidence_of(f: Fitted, result: Calibration) -> Evidence:
+    """What the rules look at."""
+    x, more = f.linear.problem.x_D, f.manipulator
+    numbers = (f.chi2, f.fit_chi2, f.linear.r, f.covariance)
+    return Evidence(
+        model=f.model,
+        arrangement=f.arrangement,
+        converged=f.converged,
+        finite=all(bool(np.isfinite(value).all()) for value in numbers),
+        dof=f.dof,
+        n_used=len(x),
+        outliers=tuple(result.outliers),
+        misfit=f.misfit,
+        chi2=f.fit_chi2,
+        chi2_dof=result.chi2_dof,
+        widened=f.widens,
+        residual_px=result.d_rms,
+        expected_px=f.stated_px,
+        spread_px=float(np.sqrt(np.mean(np.sum((x - x.mean(axis=0)) ** 2, axis=1)))),
+        scan_px=tilted_scan_sigma(result, f.linear.problem),
+        diagnosis=f.diagnosis,
+        stability=result.stability,
+        scatter=more.scatter,
+        against_rigid=more.against_rigid,
+        size=more.size,
+        run_effects=more.run_effects,
+        open_turns=more.open_turns,
+    )
+
+
+def with_findings(calibration: Calibration, more: tuple[Finding, ...]) -> Calibration:
+    """The calibration with findings of checks that need more than its own data, in place of older ones of the same
+    rules."""
+    rules = {finding.rule for finding in more}
+    return replace(calibration, checks=(*(f for f in calibration.checks if f.rule not in rules), *more))
+
+
+def parameter_list(f: Fitted) -> tuple[Parameter, ...]:
+    """The estimated numbers with their standard uncertainties: angles of T_HT, t_HT, balls, freed ones, errors."""
+    C, R = f.covariance, f.T_HT.R
+    E = angles_by_tangent(R)
+    u_angles = np.sqrt(np.einsum("ij,jk,ik->i", E, C[:3, :3], E))
+    u = np.sqrt(np.maximum(np.diag(C), 0.0))
+    result = [
+        Parameter(name=f"phi_HT_{c}", value=float(a), u=float(s), unit="rad")
+        for c, a, s in zip("xyz", angles_from_rotation(R), u_angles, strict=True)
+    ]
+    names = (*tangent_names(f.linear.problem.ball_ids, f.free)[3:], *f.p_names)
+    values = np.concatenate([f.T_HT.t, f.balls.ravel(), f.free.value + f.delta, f.p])
+    units = (*("mm",) * (3 + f.balls.size), *(unit_of(n) for n in f.free.names), *f.p_units)
+    result += [
+        Parameter(name=n, value=float(v), u=float(s), unit=unit)
+        for n, v, s, unit in zip(names, values, u[3:], units, strict=True)
+    ]
+    return tuple(result)
+
+
+def assumed_of(scanner: Scanner, free: FreeParameters) -> tuple[Assumed, ...]:
+    """The scanner parameters that were taken with the standard uncertainty that scanner.json states; 0 is exact."""
+    freed = {base_name(name) for name in free.names}
+    return tuple(
+        Assumed(
+            name=name,
+            sigma=float(sigma),
+            unit=PARAMETER_UNITS[name],
+            source="exact" if sigma == 0 else "scanner.json",
+        )
+        for name, sigma in scanner.sigma.items()
+        if name in freed or sigma == 0
+    )
+
+
+def expected_px(linear: LinearFit) -> float:
+    """d_rms that the covariances C of a fit explain, px, after the fit has used up its parameters."""
+    n, m = len(linear.r), max(linear.J.shape[2] - len(linear.prior_rows), 0)
+    total = float(np.trace(linear.C, axis1=1, axis2=2).mean())
+    return float(np.sqrt(total * max(1.0 - m / (2 * n), 0.0)))
+
+
+def magnification_at_balls(problem: Problem, scanners: tuple[Scanner, ...], T_HT: RigidTransform, t: Array) -> float:
+    """Mean over the rows of d_SD over the distance of the ball from the source along the beam; t (n, 3), mm in M."""
+    x_T = T_HT.apply((problem.R_MH @ t[:, :, None])[..., 0] + problem.t_MH)
+    found = []
+    for run, scanner in enumerate(scanners):
+        mine = problem.run == run
+        T_TW = scanner.T_TW(problem.alpha[mine])
+        x_W = (T_TW.R @ x_T[mine][:, :, None])[..., 0] + T_TW.t
+        found.append(scanner.d_SD / scanner.T_WS.apply(x_W)[:, 2])
+    return float(np.mean(np.concatenate(found)))
+
+
+def _outliers(f: Fitted) -> dict[str, str]:
+    return {
+        i: f"{d:.1f} standard deviations away, beyond what a clean run allows"
+        for i, d, k in zip(f.everything.pose_id, np.sqrt(f.distance2), f.keep, strict=True)
+        if not k
+    }

@@ -1,0 +1,190 @@
+"""One table of rules: each holds for every model and arrangement that it names, and the documentation shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tomopose.calibration.checks.convention_tests import Diagnosis, Hypothesis
+from tomopose.calibration.checks.rules import (
+    ARRANGEMENTS,
+    MODELS,
+    RULES,
+    AgainstRigid,
+    BallSize,
+    Evidence,
+    ScatterFound,
+    findings,
+    rules_table,
+)
+from tomopose.calibration.checks.stability import Effect, OutlierBlock, RepeatedPose, Stability
+from tomopose.calibration.checks.verdict import VERDICTS, Finding, judge
+
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "concepts" / "verdict.md"
+CASES = [(rule, model, arrangement) for rule in RULES for model in rule.models for arrangement in rule.arrangements]
+
+
+def clean(model: str = "rigid", arrangement: str = "moving-object") -> Evidence:
+    """A run in which nothing is wrong, and everything was looked at."""
+    identified = model != "rigid"
+    return Evidence(
+        model=model,
+        arrangement=arrangement,
+        converged=True,
+        finite=True,
+        dof=369,
+        n_used=189,
+        outliers=(),
+        misfit=False,
+        chi2=372.0,
+        chi2_dof=1.01,
+        widened=not identified,
+        residual_px=0.0207,
+        expected_px=0.0205,
+        spread_px=300.0,
+        scan_px=None if arrangement == "twin" else 0.01,
+        diagnosis=diagnosis(factor=1.0, delta=40.0, outcome="worse"),
+        stability=Stability(
+            effects=(Effect(name="drift", p=0.3, size_px=0.004, share=0.01, words="the ball drifts"),),
+            repeats=(RepeatedPose(first="0", again="188", distance_px=0.02, sigmas=1.0),),
+            held_out_rms=0.0213,
+            held_out_chi2=1.03,
+            fit_rms=0.0207,
+        ),
+        scatter=ScatterFound(ratio=1.0, t_mm=5e-4, w_rad=1.2e-5) if identified else None,
+        against_rigid=AgainstRigid(chosen_px=0.021, rigid_px=0.5, better=True) if identified else None,
+        size=1.0 if identified else None,
+        ball_size=BallSize(ratio=1.001, diameter=8.0),
+    )
+
+
+def diagnosis(*, factor: float, delta: float, outcome: str) -> Diagnosis:
+    declared, other = (
+        Hypothesis(
+            name=name,
+            words=name,
+            cure="# convention: other",
+            d_rms=0.001,
+            chi2=chi2,
+            dof=369,
+            delta=d,
+            factor=f,
+            outcome=o,
+        )
+        for name, chi2, d, f, o in (("declared", 372.0, 0.0, 1.0, "declared"), ("zyx", 360.0, delta, factor, outcome))
+    )
+    return Diagnosis(hypotheses=(other, declared))
+
+
+def moved(e: Evidence, *, at: str) -> dict[str, Any]:
+    assert e.stability is not None
+    effect = Effect(name="mount", p=1e-9, size_px=0.4, share=0.9, words="the mount changed", at=at)
+    return {"stability": replace(e.stability, effects=(effect,))}
+
+
+def repeat(e: Evidence) -> Stability:
+    assert e.stability is not None
+    return replace(e.stability, repeats=(RepeatedPose(first="0", again="188", distance_px=2.0, sigmas=70.0),))
+
+
+def met(name: str, e: Evidence) -> Mapping[str, Any]:
+    """What meets the condition of a rule."""
+    assert e.stability is not None
+    block = OutlierBlock(first="185", last="188", count=4, p=1e-6)
+    return {
+        "no optimum": {"converged": False},
+        "not finite": {"finite": False},
+        "nothing fits": {"residual_px": 40.0},
+        "alternative convention, much better": {"diagnosis": diagnosis(factor=3.0, delta=-800.0, outcome="better")},
+        "alternative convention, better": {"diagnosis": diagnosis(factor=1.2, delta=-60.0, outcome="better")},
+        "many centres do not fit": {"misfit": True},
+        "outliers": {"outliers": tuple(str(k) for k in range(28)), "n_used": 161},
+        "block of outliers": {
+            "outliers": ("185", "186", "187", "188"),
+            "stability": replace(e.stability, block=block),
+        },
+        "set aside": {"outliers": ("3",)},
+        "degrees of freedom": {"dof": 7},
+        "unexplained residuals": {"chi2_dof": 6.0, "chi2": 6.0 * 369, "residual_px": 0.0507},
+        "residuals above the stated uncertainty": {"chi2": 1.5 * 369, "chi2_dof": 1.5, "widened": False},
+        "residuals below the stated uncertainty": {"chi2_dof": 0.01},
+        "drift": moved(e, at=""),
+        "step": moved(e, at="100"),
+        "repeated pose": {"stability": repeat(e)},
+        "repeated pose, set aside": {"stability": repeat(e), "outliers": ("188",)},
+        "held-out poses": {"stability": replace(e.stability, held_out_rms=0.09, held_out_chi2=20.0)},
+        "uncertainty of a tilted scan": {"scan_px": 0.3},
+        "scatter of the poses": {"scatter": ScatterFound(ratio=16.0, t_mm=5e-4, w_rad=1.2e-5)},
+        "no better than trusted poses": {"against_rigid": AgainstRigid(chosen_px=0.03, rigid_px=0.02, better=False)},
+        "size of the errors": {"size": 7.0},
+        "drift or lag of the manipulator": {"run_effects": True},
+        "undetermined turns": {"open_turns": "one ball cannot determine the turns"},
+        "size of the ball": {"ball_size": BallSize(ratio=1.013, diameter=8.0)},
+        "size of the ball, noted": {"ball_size": BallSize(ratio=0.993, diameter=8.0)},
+    }[name]
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("arrangement", ARRANGEMENTS)
+def test_a_clean_run_is_trustworthy_by_every_model_and_arrangement(model, arrangement):
+    assert findings(clean(model, arrangement)) == ()
+    assert judge(()) == ("trustworthy", ())
+
+
+@pytest.mark.parametrize(
+    ("rule", "model", "arrangement"), CASES, ids=[f"{r.name}-{m}-{a}".replace(" ", "_") for r, m, a in CASES]
+)
+def test_every_rule_holds_for_every_model_and_arrangement(rule, model, arrangement):
+    e = clean(model, arrangement)
+    found = findings(replace(e, **met(rule.name, e)))
+    (mine,) = (f for f in found if f.rule == rule.name)
+    assert (mine.verdict, mine.limit) == (rule.verdict, pytest.approx(rule.limit, nan_ok=True))
+    assert mine.words
+    word, reasons = judge(found)
+    assert VERDICTS.index(word) >= VERDICTS.index(rule.verdict)
+    assert (mine.words in reasons) == (rule.verdict != "trustworthy")
+
+
+def test_only_the_verdict_of_the_findings_counts_the_worst_first():
+    rows = [
+        Finding(rule=str(k), value=0.0, limit=0.0, words=verdict, verdict=verdict)
+        for k, verdict in enumerate(("trustworthy", "doubtful", "rejected", "doubtful"))
+    ]
+    assert judge(rows) == ("rejected", ("rejected", "doubtful", "doubtful"))
+    assert judge(rows[:1]) == ("trustworthy", ())
+
+
+@pytest.mark.parametrize("name", ["residual_px", "chi2_dof", "scan_px"])
+@pytest.mark.parametrize("model", MODELS)
+def test_what_is_not_a_number_passes_no_guard(name, model):
+    e = replace(clean(model), **{name: float("nan")})
+    assert judge(findings(e))[0] != "trustworthy"
+
+
+def test_an_alternative_that_identified_errors_explain_is_dropped():
+    """Poses that were trusted may prefer another convention where the machine errs; the identified model does not."""
+    e = clean("kinematic")
+    better = diagnosis(factor=3.0, delta=-800.0, outcome="better")
+    assert judge(findings(replace(e, diagnosis=better)))[0] == "rejected"
+    assert judge(findings(replace(e, diagnosis=better, residual_px=0.0005, expected_px=0.0005)))[0] == "trustworthy"
+
+
+def test_effects_need_a_share_of_chi2_where_residuals_are_not_white():
+    e = clean("kinematic")
+    assert e.stability is not None
+    small = Effect(name="mount", p=1e-9, size_px=0.4, share=0.1, words="the mount changed", at="100")
+    e = replace(e, stability=replace(e.stability, effects=(small,)))
+    assert [f.rule for f in findings(e)] == ["step"]
+    scattered = replace(e, scatter=ScatterFound(ratio=8.0, t_mm=5e-4, w_rad=1.2e-5))
+    assert findings(scattered) == ()
+
+
+def test_the_documentation_shows_the_rules():
+    text = DOCS.read_text(encoding="utf-8")
+    assert rules_table() in text, (
+        f"write the output of tomopose.calibration.checks.rules.rules_table() into {DOCS.name}"
+    )
