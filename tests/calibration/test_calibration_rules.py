@@ -67,7 +67,8 @@ def diagnosis(*, factor: float, delta: float, outcome: str) -> Diagnosis:
         Hypothesis(
             name=name,
             words=name,
-            cure="# convention: other",
+            remedy="# convention: other",
+            sigmas=1.2,
             d_rms=0.001,
             chi2=chi2,
             dof=369,

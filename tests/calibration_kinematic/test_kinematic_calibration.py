@@ -90,7 +90,7 @@ def test_a_perfect_machine_stays_rigid(kind: str) -> None:
     np.testing.assert_array_equal(cal.T_HT.matrix, rigid.T_HT.matrix)
     assert scan_error(cal, e).shared < 0.006
     models = {m.model: m for m in cal.comparison.models}
-    assert models["kinematic"]["log_evidence"] < models["rigid"]["log_evidence"] + EVIDENCE_GAIN
+    assert models["kinematic"].log_evidence < models["rigid"].log_evidence + EVIDENCE_GAIN
 
 
 def test_small_errors_get_a_small_prior() -> None:

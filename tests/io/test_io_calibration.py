@@ -69,7 +69,17 @@ INTERFACE = {
 
 def hypothesis(name: str, delta: float) -> Hypothesis:
     return Hypothesis(
-        name=name, words=name, cure="", d_rms=0.1, chi2=9.0, dof=5, delta=delta, factor=1 / 3, outcome="same"
+        name=name,
+        words=name,
+        remedy="",
+        sigmas=1.5,
+        ball_mm=300.0,
+        d_rms=0.1,
+        chi2=9.0,
+        dof=5,
+        delta=delta,
+        factor=1 / 3,
+        outcome="same",
     )
 
 

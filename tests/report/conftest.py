@@ -40,7 +40,16 @@ def predicted(scanner: Scanner, T_HT: RigidTransform, poses: PoseSequence, delta
 
 def hypothesis(name: str, words: str, cure: str, d_rms: float, delta: float, outcome: str) -> Hypothesis:
     return Hypothesis(
-        name=name, words=words, cure=cure, d_rms=d_rms, chi2=100.0, dof=90, delta=delta, factor=1.0, outcome=outcome
+        name=name,
+        words=words,
+        remedy=cure,
+        sigmas=1.2,
+        d_rms=d_rms,
+        chi2=100.0,
+        dof=90,
+        delta=delta,
+        factor=1.0,
+        outcome=outcome,
     )
 
 

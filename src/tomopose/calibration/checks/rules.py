@@ -219,8 +219,8 @@ def _alternatives(e: Evidence, much: bool) -> Iterator[Found]:
             yield Found(
                 value=h.factor if much else h.delta,
                 words=f"an alternative convention fits significantly better: {h.words} (delta chi2 {h.delta:.3g}, "
-                f"limit {-BETTER:g}; d_rms {h.d_rms:.3g} px instead of {e.residual_px:.3g} px); to try: {h.cure}",
-                remedy=h.cure,
+                f"limit {-BETTER:g}; d_rms {h.d_rms:.3g} px instead of {e.residual_px:.3g} px); to try: {h.remedy}",
+                remedy=h.remedy,
             )
 
 

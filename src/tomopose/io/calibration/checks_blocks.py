@@ -53,21 +53,31 @@ def finding_from(row: Mapping[str, Any]) -> Finding:
 
 
 def hypothesis_document(h: Hypothesis) -> dict[str, Any]:
-    return h.to_json()
+    more = {name: encode(getattr(h, name)) for name in ("length_factor", "ball_mm", "off_axis")}
+    return (
+        {name: encode(v) if isinstance(v, float) else v for name, v in h.to_json().items()}
+        | more
+        | {"possible": h.possible}
+    )
 
 
 def hypothesis_from(row: Mapping[str, Any]) -> Hypothesis:
     return Hypothesis(
         name=row["name"],
         words=row.get("words", ""),
-        cure=row.get("cure", ""),
+        remedy=row.get("cure", ""),
         d_rms=number(row.get("d_rms_px")),
         chi2=number(row.get("chi2")),
         dof=int(row.get("dof", 0)),
+        sigmas=number(row.get("sigmas")),
         delta=number(row.get("delta_chi2")),
         factor=number(row.get("factor")),
         outcome=row.get("outcome", "worse"),
         symmetry=bool(row.get("symmetry", False)),
+        length_factor=number(row.get("length_factor", 1.0)),
+        ball_mm=number(row.get("ball_mm")),
+        off_axis=number(row.get("off_axis", "inf")),
+        possible=bool(row.get("possible", True)),
     )
 
 

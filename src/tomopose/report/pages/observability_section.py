@@ -12,6 +12,7 @@ from tomopose.report.figures.coverage_figures import correlation_map, singular_v
 from tomopose.report.page import Block, Section, Table, Words
 from tomopose.report.words import NOT_GIVEN, cell, heading
 
+EXCLUDED = ("worse", "unfit")
 HYPOTHESIS_COLUMNS = ("words", "verdict", "d_rms_px", "delta_chi2", "cure")
 
 
@@ -47,8 +48,8 @@ def _hypotheses(hypotheses: Sequence[Hypothesis]) -> list[Block]:
     """Alternatives that are still possible, open to view; those that the data exclude, folded away."""
     if not hypotheses:
         return [Words(title="Alternative conventions", paragraphs=[f"Hypotheses tried: {NOT_GIVEN}."])]
-    excluded = [h for h in hypotheses if h.outcome == "worse"]
-    possible = [h for h in hypotheses if h.outcome != "worse"]
+    excluded = [h for h in hypotheses if h.outcome in EXCLUDED]
+    possible = [h for h in hypotheses if h.outcome not in EXCLUDED]
     tables = []
     for title, rows, words in (
         (
@@ -66,7 +67,7 @@ def _hypotheses(hypotheses: Sequence[Hypothesis]) -> list[Block]:
                     meaning=words,
                     columns=[heading(c) for c in HYPOTHESIS_COLUMNS],
                     rows=[
-                        [h.words, WORDS.get(h.outcome, h.outcome), cell(h.d_rms), _difference(h.delta), cell(h.cure)]
+                        [h.words, WORDS.get(h.outcome, h.outcome), cell(h.d_rms), _difference(h.delta), cell(h.remedy)]
                         for h in rows
                     ],
                     folded=rows is excluded,
