@@ -41,6 +41,10 @@ from .geometry.transforms import RigidTransform as RigidTransform
 from .io.calibration_json import read_calibration as read_calibration
 from .io.calibration_json import write_calibration as write_calibration
 from .io.foreign.pi_gcs import read_gcs_log as read_gcs_log
+from .io.foreign.pose_log import PoseLog as PoseLog
+from .io.foreign.reading import read_pose_log as read_pose_log
+from .io.foreign.reading import read_scanner_draft as read_scanner_draft
+from .io.foreign.scanner_draft import ScannerDraft as ScannerDraft
 from .io.images.correction import FlatField as FlatField
 from .io.images.frames import FrameSource as FrameSource
 from .io.images.opening import open_images as open_images
@@ -58,6 +62,7 @@ from .io.poses_csv import read_poses as read_poses
 from .io.poses_csv import write_poses as write_poses
 from .io.scanner_json import read_scanner as read_scanner
 from .io.scanner_json import write_scanner as write_scanner
+from .io.table_text import TextTable as TextTable
 from .io.volume_files import read_volume as read_volume
 from .io.volume_files import write_volume as write_volume
 from .manipulator.error_models import commands_for as commands_for

@@ -22,6 +22,7 @@ TomoposeError
 ├ ExportError
 │   └ NotRepresentableError     (format, indices)
 └ FileError                     (path)
+    ├ UnknownKindError          also a ConventionError
     └ SchemaVersionError
 """
 
@@ -30,6 +31,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+
+class InputWarning(UserWarning):
+    """A file was read, but something in it should be looked at."""
 
 
 class TomoposeError(Exception):
@@ -164,6 +169,10 @@ class FileError(TomoposeError):
     def __init__(self, message: str, *, path: str | Path | None = None) -> None:
         super().__init__(message)
         self.path = path
+
+
+class UnknownKindError(FileError, ConventionError):
+    """What kind of file this is cannot be determined."""
 
 
 class SchemaVersionError(FileError):

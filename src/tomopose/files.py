@@ -32,7 +32,15 @@ __all__ = [
     "write_text",
 ]
 
+NUMBER_RUN = re.compile(r"(\d+)")
 SCHEMA = re.compile(r"tomopose/(?P<name>[a-z0-9-]+)/(?P<version>\d+)")
+
+
+def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Sort key that counts: pose_2 before pose_10."""
+    return tuple(
+        (0, int(part), part) if part.isdigit() else (1, 0, part.lower()) for part in NUMBER_RUN.split(name) if part
+    )
 
 
 def plain(value: Any) -> Any:

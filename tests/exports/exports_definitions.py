@@ -229,4 +229,25 @@ def ctsimu(folder, x):
     return on_panel(S, C, U, V, x, detector["columns"]["value"], detector["rows"]["value"])
 
 
-DEFINITIONS = {f.__name__: f for f in (astra, rtk, rtk_params, leap, tigre, cil, cera, openct, ctsimu, pyronn)}
+def thd(folder, x):
+    """Focal spot, detector centre and the detector's axes as columns of its quaternion (x, y, z, w)."""
+    views = [json.loads(p.read_text()) for p in sorted((folder / "thd").glob("*.json"), key=lambda p: p.name)]
+    geometry = [v["projection_geometry"] for v in views]
+    R = Rotation.from_quat([g["detector_center_orientation_quat"] for g in geometry]).as_matrix()
+    panel = views[0]["detector"]
+    n_u, n_v = panel["image_width_px"], panel["image_height_px"]
+    S = np.array([g["focal_spot_position_mm"] for g in geometry])
+    C = np.array([g["detector_center_position_mm"] for g in geometry])
+    U, V = panel["pixel_pitch_width_mm"] * R[:, :, 0], panel["pixel_pitch_height_mm"] * R[:, :, 1]
+    return on_panel(S, C, U, V, x, n_u, n_v)
+
+
+def rx(folder, x):
+    """`top` and `right` are half the panel's height and width away from its centre, as readers for CIL take them."""
+    t = np.loadtxt(folder / "geom.csv", delimiter=";", skiprows=2, usecols=range(1, 13), ndmin=2)
+    n_u, n_v = size(folder)
+    U, V = (t[:, 9:12] - t[:, 3:6]) / n_u * 2, (t[:, 6:9] - t[:, 3:6]) / n_v * 2
+    return on_panel(t[:, :3], t[:, 3:6], U, V, x, n_u, n_v)
+
+
+DEFINITIONS = {f.__name__: f for f in (astra, rtk, rtk_params, leap, tigre, cil, cera, openct, ctsimu, pyronn, thd, rx)}

@@ -77,4 +77,6 @@ def test_only_the_formats_that_can_follow_the_row_order(tmp_path):
         "openct": "bottom",
         "ctsimu": "bottom",
         "pyronn": "top",
+        "thd": "top",
+        "rx": "top",
     }

@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 from exports_cases import TOLERANCE_PX, points, random_matrices
 
-from tomopose.errors import ConventionError, FileError, InputError, SchemaVersionError, TomoposeError, UnitError
+from tomopose.errors import (
+    ConventionError,
+    FileError,
+    InputError,
+    InputWarning,
+    SchemaVersionError,
+    TomoposeError,
+    UnitError,
+)
 from tomopose.exports import FORMATS, export, read_geometry
 from tomopose.exports.openct import FRAMES, detector_frame
 
@@ -25,6 +33,8 @@ MAIN_FILE = {
     "openct": "openct.json",
     "ctsimu": "ctsimu.json",
     "pyronn": "pyronn.npz",
+    "thd": "thd",
+    "rx": "geom.csv",
 }
 
 
@@ -99,12 +109,12 @@ def test_a_missing_option_is_named(format, needs, bare, matrices):
     )
 
 
-@pytest.mark.parametrize("format", ["cil", "tigre", "cera", "openct", "ctsimu"])
+@pytest.mark.parametrize("format", ["cil", "tigre", "cera", "openct", "ctsimu", "thd"])
 def test_formats_that_hold_the_detector_need_no_option(format, bare, matrices):
     assert_same(read_geometry(bare / MAIN_FILE[format]), matrices)
 
 
-@pytest.mark.parametrize("format", ["cil", "tigre", "cera", "openct", "ctsimu", "rtk"])
+@pytest.mark.parametrize("format", ["cil", "tigre", "cera", "openct", "ctsimu", "rtk", "thd"])
 @pytest.mark.parametrize(("name", "value"), [("n_u", 302), ("n_v", 256), ("p_u", 0.201), ("p_v", 0.2)])
 def test_an_option_that_contradicts_the_file_is_refused(format, name, value, bare):
     side = bare / "rtk.json" if format == "rtk" else None
@@ -138,7 +148,9 @@ def test_the_row_order_matters_where_the_numbers_follow_it(format, matrices, tmp
     (tmp_path / "out" / "manifest.json").unlink()
     path = tmp_path / "out" / MAIN_FILE[format]
     assert_same(read_geometry(path, rows="top", **options(matrices)), matrices)
-    wrong = read_geometry(path, rows="bottom", **options(matrices))
+    with pytest.raises(ConventionError, match=r"are mirrored, seen from the source; try --rows top"):
+        read_geometry(path, rows="bottom", **options(matrices))
+    wrong = read_geometry(path, rows="bottom", mirrored=True, **options(matrices))
     np.testing.assert_allclose(
         wrong.project(X)[..., 1], matrices.n_v - 1 - matrices.project(X)[..., 1], rtol=0, atol=TOLERANCE_PX
     )
@@ -152,17 +164,17 @@ def test_unknown_format_and_row_order(bare):
     with pytest.raises(ConventionError, match="is a file of format rtk, not cera"):
         read_geometry(bare / "rtk.xml", format="cera")
     (bare / "x.txt").write_text("1 2 3")
-    with pytest.raises(ConventionError, match="is no file of format astra"):
+    with pytest.raises(ConventionError, match="is not a file of format astra"):
         read_geometry(bare / "x.txt", format="astra")
 
 
 def test_a_format_is_never_guessed_from_thin_air(bare):
     for name, content in (("a.txt", "1 2 3\n4 5 6\n"), ("b.json", '{"matrices": []}')):
         (bare / name).write_text(content)
-        with pytest.raises(ConventionError, match="cannot be told"):
+        with pytest.raises(ConventionError, match="cannot be determined"):
             read_geometry(bare / name)
     np.save(bare / "c.npy", np.zeros((4, 11)))
-    with pytest.raises(ConventionError, match="cannot be told"):
+    with pytest.raises(ConventionError, match="cannot be determined"):
         read_geometry(bare / "c.npy")
 
 
@@ -226,8 +238,7 @@ def test_a_newer_manifest_and_a_missing_format(matrices, tmp_path):
 def test_a_truncated_file_is_refused(format, bare, matrices):
     """Cut anywhere: an error of the tree, never a shorter scan."""
     path = bare / MAIN_FILE[format]
-    if format == "cera":
-        path = bare / "cera_projtable.txt"
+    path = {"cera": bare / "cera_projtable.txt", "thd": bare / "thd" / "view_0.json"}.get(format, path)
     whole = path.read_bytes()
     for part in (0.02, 0.3, 0.7, 0.97):
         path.write_bytes(whole[: int(part * len(whole))])
@@ -339,12 +350,13 @@ def damage_bytes(whole, rng):
     return bytes(data)
 
 
-@pytest.mark.parametrize("file", [*MAIN_FILE.values(), "cera_projtable.txt", "rtk.json"])
+@pytest.mark.parametrize("file", [*MAIN_FILE.values(), "cera_projtable.txt", "rtk.json", "thd/view_2.json"])
 def test_damage_is_an_error_of_the_tree_or_a_whole_geometry(file, bare, matrices):
     """Whatever stands in a file: never another exception, never a number that is not finite, never fewer views."""
     rng = np.random.default_rng(len(file))
+    file = "thd/view_0.json" if file == "thd" else file
     path, whole = bare / file, (bare / file).read_bytes()
-    main = bare / {"cera_projtable.txt": "cera.config", "rtk.json": "rtk.xml"}.get(file, file)
+    main = bare / {"cera_projtable.txt": "cera.config", "rtk.json": "rtk.xml"}.get(file, file.split("/")[0])
     format = next(name for name, f in MAIN_FILE.items() if f == main.name)
     refused = 0
     for _ in range(60):
@@ -370,9 +382,11 @@ def read_rtk(folder, **given):
     return read_geometry(folder / "rtk.xml", side=folder / "rtk.json", **given)
 
 
-def test_rtk_needs_its_side_file(bare, matrices):
-    with pytest.raises(InputError, match="--side"):
-        read_geometry(bare / "rtk.xml", **options(matrices))
+def test_rtk_needs_size_and_pitch_or_its_side_file(bare, matrices):
+    with pytest.raises(InputError, match=r"--p-v-mm missing\).*--side"):
+        read_geometry(bare / "rtk.xml", **{k: v for k, v in options(matrices).items() if k != "p_v"})
+    with pytest.warns(InputWarning, match="the panel is taken as centred"):
+        assert_same(read_geometry(bare / "rtk.xml", **options(matrices)), matrices)
     with pytest.raises(FileError, match="does not exist"):
         read_geometry(bare / "rtk.xml", side=bare / "no.json")
 
@@ -438,10 +452,10 @@ def test_rtk_side_files_that_say_too_little(change, words, bare):
 @pytest.mark.parametrize(
     ("pattern", "by", "error", "words"),
     [
-        (r'version="3"', 'version="4"', SchemaVersionError, "version '4'; version 3 is read"),
+        (r'version="3"', 'version="4"', SchemaVersionError, "version '4'; versions 2 and 3 are read"),
         (r"<RTKThreeD(.*)</RTKThreeDCircularGeometry>", r"<Other></Other>", InputError, "root element"),
         (r"<GantryAngle>[^<]*<", "<GantryAngle>east<", InputError, "GantryAngle"),
-        (r"<GantryAngle>([^<]*)</GantryAngle>", r"<GantryTilt>\1</GantryTilt>", InputError, "unknown element"),
+        (r"<GantryAngle>([^<]*)</GantryAngle>", r"<GantryAngel>\1</GantryAngel>", InputError, "did you mean"),
         (r"<SourceToIsocenterDistance>", "<SourceToIsocenterDistance>-", InputError, "both must be positive"),
         (r"<Matrix>\s*\S+", "<Matrix>", InputError, "Matrix of view 0"),
         (
@@ -597,7 +611,7 @@ def stage(content):
             InputError,
             "'drift' is not read",
         ),
-        (lambda d: stage(d)["center"]["x"]["drifts"][0].update(value=None, file="x.csv"), InputError, "x.csv"),
+        (lambda d: stage(d)["center"]["x"]["drifts"][0].update(value=None, file="x.csv"), FileError, "x.csv"),
         (lambda d: stage(d)["center"]["x"]["drifts"][0].update(value=[]), InputError, "no values"),
         (lambda d: stage(d)["center"]["x"]["drifts"][0].update(known_to_reconstruction="yes"), InputError, "'yes'"),
         (lambda d: stage(d)["vector_u"]["x"].update(drifts=[{"value": [0, 1]}]), InputError, "vector_u drifts"),

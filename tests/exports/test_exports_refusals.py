@@ -16,7 +16,7 @@ from tomopose.exports import FORMATS, export, read_geometry
 from tomopose.geometry.projection import row_flip
 
 X = points(m=6)
-ROTATION_ONLY = {"rtk", "tigre", "ctsimu"}
+ROTATION_ONLY = {"rtk", "tigre", "ctsimu", "thd"}
 PLAIN_MATRICES = {"pyronn", "cera", "openct"}
 
 
@@ -103,10 +103,10 @@ def test_unknown_row_order(rows, tmp_path):
 def test_nothing_is_overwritten_without_force(tmp_path):
     first, second = random_matrices(16), random_matrices(17)
     export(first, tmp_path / "out")
-    before = {p.name: p.read_bytes() for p in (tmp_path / "out").iterdir()}
+    before = {p: p.read_bytes() for p in (tmp_path / "out").rglob("*.*")}
     with pytest.raises(FileError, match="exists already"):
         export(second, tmp_path / "out")
-    assert {p.name: p.read_bytes() for p in (tmp_path / "out").iterdir()} == before
+    assert {p: p.read_bytes() for p in (tmp_path / "out").rglob("*.*")} == before
     export(second, tmp_path / "out", force=True)
     np.testing.assert_allclose(read_geometry(tmp_path / "out").project(X), second.project(X), rtol=0, atol=TOLERANCE_PX)
 
@@ -127,6 +127,8 @@ def test_the_folder_holds_the_prescribed_files_and_its_manifest_says_what_they_a
         "openct.json",
         "ctsimu.json",
         "pyronn.npz",
+        "thd",
+        "geom.csv",
     }
     content = manifest(tmp_path / "out")
     assert content["schema"] == "tomopose/exports/1"
@@ -160,7 +162,7 @@ def test_cera_follows_the_order_of_the_image_files(tmp_path):
 def test_the_same_geometry_gives_the_same_files(tmp_path):
     for k in "ab":
         export(random_matrices(21), tmp_path / k)
-    for name in (p.name for p in (tmp_path / "a").iterdir()):
+    for name in (str(p.relative_to(tmp_path / "a")) for p in (tmp_path / "a").rglob("*.*")):
         a, b = ((tmp_path / k / name).read_bytes() for k in "ab")
         if name not in ("manifest.json", "cera_projtable.txt"):  # these two carry the time
             assert a == b, name

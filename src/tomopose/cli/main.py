@@ -42,6 +42,7 @@ VERBS = (
     "calibrate",
     "diagnose",
     "plan",
+    "import_scanner",
     "import_poses",
     "matrices",
     "export",

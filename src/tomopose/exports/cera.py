@@ -31,7 +31,12 @@ UNTOUCHED = {
     "CropBorderTop": "0",
     "CropBorderBottom": "0",
 }
-"""Keys that change which pixel a matrix means; other values than these are refused, because their effect is unknown."""
+"""Keys that change the projections; other values than these are refused."""
+EFFECT = {
+    "SkipProjectionInterval": "it leaves projections out, and which matrices remain is not documented",
+    "Rotation": "it turns the images, and whether the matrices mean them before or after is not documented",
+}
+MOVES = "it moves the pixels, and whether the matrices mean them before or after is not documented"
 
 
 def to_cera(
@@ -100,7 +105,8 @@ def cera_config(text: str, *, where: str = "the CERA .config") -> tuple[dict[str
         )
     for name, plain in UNTOUCHED.items():
         if keys.get(name, plain).lower() != plain.lower():
-            raise InputError(f"{where}: {name} = {keys[name]}; only {name} = {plain} is read, it moves the pixels")
+            why = EFFECT.get(name, MOVES)
+            raise InputError(f"{where}: {name} = {keys[name]}; only {name} = {plain} is read: {why}")
     numbers_of = {"n_u": "NumChannelsPerRow", "n_v": "NumRows", "p_u": "PixelSizeU", "p_v": "PixelSizeV"}
     found: dict[str, Any] = {}
     for name, key in {**numbers_of, "n": "NumProjections"}.items():
@@ -112,15 +118,31 @@ def cera_config(text: str, *, where: str = "the CERA .config") -> tuple[dict[str
     return found, table
 
 
+HEAD = re.compile(r"(?:\S+\s+)?projtable(?:\.txt)?\s+version\s+(?P<version>\S.*)", re.IGNORECASE)
+"""First line of a table: `projtable.txt version 3` (ctsimu, aRTist), `projtable version 3` (CONRAD,
+EpipolarConsistency), `ETRI projtable version iterative`."""
+INDEX = re.compile(r"@\s*(\d+)")
+
+
+def is_cera_table(text: str) -> bool:
+    """Whether a text begins as a projection table of any writer does."""
+    return HEAD.fullmatch(text.lstrip("\ufeff").split("\n", 1)[0].strip()) is not None
+
+
 def cera_table(text: str, *, where: str = "the CERA table") -> Array:
-    """The matrices (n, 3, 4) of a table of version 3."""
-    lines = [line.strip() for line in text.splitlines()]
+    """The matrices (n, 3, 4) of a table.
+
+    Read in the dialects of ctsimu and aRTist, CONRAD, EpipolarConsistency and ETRI: they differ in the first line, in
+    blanks, and in counting the matrices from 0 or from 1.
+    """
+    lines = [line.strip() for line in text.lstrip("\ufeff").splitlines()]
     first = lines[0] if lines else ""
-    head = re.fullmatch(r"projtable\.txt version (\d+)", first)
+    head = HEAD.fullmatch(first)
     if not head:
-        raise InputError(f"{where}: the first line is {first[:60]!r}, not 'projtable.txt version 3'")
-    if int(head[1]) != TABLE_VERSION:
-        raise SchemaVersionError(f"{where}: table version {head[1]}; version {TABLE_VERSION} is read")
+        raise InputError(f"{where}: the first line is {first[:60]!r}, not 'projtable.txt version 3' or one like it")
+    number = re.match(r"\d+", head["version"])
+    if number and int(number[0]) != TABLE_VERSION:
+        raise SchemaVersionError(f"{where}: table version {number[0]}; version {TABLE_VERSION} is read")
     # The second line is the date, whatever its wording; comments and blank lines carry nothing.
     body = [line for line in lines[2:] if line and not line.startswith("#")]
     if not body or not body[0].isdigit():
@@ -130,13 +152,16 @@ def cera_table(text: str, *, where: str = "the CERA table") -> Array:
         raise InputError(
             f"{where} announces {n} matrices (five lines each) but {len(rest)} lines follow; is the file truncated?"
         )
+    start = INDEX.fullmatch(rest[0])
+    base = int(start[1]) if start and int(start[1]) in (0, 1) else 1
     for k in range(n):
-        if rest[5 * k] != f"@{k + 1}":
-            raise InputError(f"{where}: '@{k + 1}' is due but {rest[5 * k][:40]!r} stands there")
+        found = INDEX.fullmatch(rest[5 * k])
+        if not found or int(found[1]) != k + base:
+            raise InputError(f"{where}: '@{k + base}' is due but {rest[5 * k][:40]!r} is there")
     rows = [rest[5 * k + j].split() for k in range(n) for j in (2, 3, 4)]
     bad = [i for i, row in enumerate(rows) if len(row) != 4]
     if bad:
-        raise InputError(f"{where}: a row of matrix @{bad[0] // 3 + 1} has {len(rows[bad[0]])} numbers, not 4")
+        raise InputError(f"{where}: a row of matrix @{bad[0] // 3 + base} has {len(rows[bad[0]])} numbers, not 4")
     return numbers(rows, (3 * n, 4), where).reshape(n, 3, 4)
 
 

@@ -2,19 +2,23 @@
 
 Per frame and part: the standard pose, the stage's turn about w between start and stop angle, the deviations in their
 order (about world axes x, y, z or the part's own axes u, v, w as they then stand), and at last the drift of the centre.
-Only what is `known_to_reconstruction` counts.  A list of drift values is stretched over the scan and interpolated
-linearly.  W is the stage turned by 180 degrees about its w axis.  Source: CTSimU scenario file format 1.2.
+Only what is `known_to_reconstruction` counts.  A list of drift values, in the scenario or in a file that it names, is
+stretched over the scan and interpolated linearly.  A parameter that is null is not relevant: the toolbox counts it as
+0, and so does this reader, where the geometry can do without it.  W is the stage turned by 180 degrees about its w
+axis. Source: CTSimU scenario file format 1.2.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
 
-from tomopose.errors import InputError, SchemaVersionError, UnitError
+from tomopose.errors import FileError, InputError, SchemaVersionError, UnitError
 from tomopose.exports.panel import Given, matrices_of_panels, numbers
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.geometry.rotations import R_z, exp_rotation
@@ -25,6 +29,7 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "mm": {"nm": 1e-6, "um": 1e-3, "mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0},
     "rad": {"rad": 1.0, "deg": np.pi / 180},
     "": {"": 1.0},
+    "px": {"": 1.0, "px": 1.0},
 }
 REMARKS = ("comment", "comments", "description", "name", "type", "beam_divergence", "uncertainty", "uncertainty_unit")
 
@@ -33,10 +38,12 @@ def from_ctsimu(content: Mapping[str, Any], given: Given, *, where: str = "the C
     """Matrices of a scenario's JSON content.  v counts upwards in them, whatever the order of the image files.
 
     Raises InputError, with the place in the file, where it says something that is not read: parts attached to the
-    stage, drifts of direction vectors, drifts kept in other files, pixel binning, deviations of formats before 1.0.
+    stage, drifts of direction vectors, pixel binning, deviations of formats before 1.0.  Drift files are looked for
+    from `given.folder`; FileError names one that is not there.
     """
     _check_version(content, where)
     acquisition = _section(content, "acquisition", where)
+    files = _Files(given.folder)
     n = acquisition.get("number_of_projections")
     n = n.get("value") if isinstance(n, Mapping) else n
     if isinstance(n, bool) or not isinstance(n, int) or n < 1:
@@ -49,12 +56,12 @@ def from_ctsimu(content: Mapping[str, Any], given: Given, *, where: str = "the C
     if _section(geometry, "source", f"{where}: geometry").get("type") == "parallel":
         raise InputError(f"{where}: geometry.source.type is 'parallel'; only cone beams are read")
     parts = {
-        name: _part(_section(geometry, name, f"{where}: geometry"), n, f"{where}: geometry.{name}", turn)
+        name: _part(files.filled(_section(geometry, name, f"{where}: geometry")), n, f"{where}: geometry.{name}", turn)
         for name, turn in (("source", None), ("detector", None), ("stage", stage_angles(acquisition, n, where)))
     }
     pitch = _section(detector, "pixel_pitch", f"{where}: detector")
     p_u, p_v = (_constant(pitch, k, n, "mm", f"{where}: detector.pixel_pitch") for k in "uv")
-    n_u, n_v = (_constant(detector, k, n, "", f"{where}: detector") for k in ("columns", "rows"))
+    n_u, n_v = (_constant(detector, k, n, "px", f"{where}: detector") for k in ("columns", "rows"))
     settled = Given(
         n_u=given.settle("n_u", int(n_u), where),
         n_v=given.settle("n_v", int(n_v), where),
@@ -77,6 +84,42 @@ def from_ctsimu(content: Mapping[str, Any], given: Given, *, where: str = "the C
         rows="bottom",
         where=where,
     )
+
+
+@dataclass(frozen=True)
+class _Files:
+    """Files that a scenario names, relative to its folder."""
+
+    folder: Path | None
+
+    def filled(self, part: Any) -> Any:
+        """The same JSON with each drift's file read into its `value`."""
+        if isinstance(part, list):
+            return [self.filled(p) for p in part]
+        if not isinstance(part, Mapping):
+            return part
+        filled = {k: self.filled(v) for k, v in part.items()}
+        name = filled.get("file")
+        name = name.get("value") if isinstance(name, Mapping) else name
+        if isinstance(name, str) and name and filled.get("value") is None:
+            filled["value"] = self._column(name)
+        return filled
+
+    def _column(self, name: str) -> list[float]:
+        """The first column of a drift file."""
+        path = (self.folder or Path()) / PureWindowsPath(name).as_posix()
+        try:
+            lines = path.read_text(encoding="utf-8-sig").splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            raise FileError(
+                f"the scenario names the drift file {name}, which cannot be read: {error}", path=path
+            ) from error
+        rows = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
+        words = [re.split(r"[\s,;]+", line.strip())[0] for line in rows]
+        try:
+            return [float(w) for w in words]
+        except ValueError as error:
+            raise InputError(f"{path}: a drift value is not a number: {error}") from error
 
 
 def stage_angles(acquisition: Mapping[str, Any], n: int, where: str) -> Array:
@@ -105,7 +148,7 @@ class _Pose:
 def _part(geo: Mapping[str, Any], n: int, where: str, turn: Array | None) -> _Pose:
     _known(geo, ("center", "centre", "vector_u", "vector_w", "deviations"), where)
     centre_json = _section(geo, "centre" if "centre" in geo else "center", where)
-    if not all(k in centre_json for k in "xyz"):
+    if not all(k in centre_json for k in "xyz"):  # null coordinates are there
         raise InputError(f"{where}.center has no x, y, z; parts attached to the stage are not read")
     base, drift = _vector(centre_json, "xyz", n, "mm", f"{where}.center")
     directions = []
@@ -125,6 +168,8 @@ def _part(geo: Mapping[str, Any], n: int, where: str, turn: Array | None) -> _Po
         axes = axes @ R_z(turn)
     pose = _Pose(centre=np.repeat(base[None], n, axis=0), axes=axes)
     for k, deviation in enumerate(_list(geo.get("deviations"), f"{where}.deviations")):
+        if deviation is None or deviation.get("amount", 0) is None:
+            continue  # null: not relevant
         pose = _deviate(pose, deviation, n, f"{where}.deviations[{k}]")
     return _Pose(centre=pose.centre + drift, axes=pose.axes)
 
@@ -182,11 +227,12 @@ def _vector(json: Mapping[str, Any], names: str, n: int, kind: str, where: str) 
 
 
 def _values(json: Any, n: int, kind: str, where: str) -> tuple[float, Array]:
-    """A parameter's standard value and the sum of its drifts (n,), in mm, rad or without unit."""
+    """A parameter's standard value (null is 0) and the sum of its drifts (n,), in mm, rad, px or without unit."""
     if not isinstance(json, Mapping):
         json = {"value": json}
     _known(json, ("value", "unit", "drifts"), where)
-    value = float(numbers(json.get("value"), (), where)) * _unit(json, kind, where, zero=json.get("value") == 0)
+    value = json.get("value")
+    value = 0.0 if value is None else float(numbers(value, (), where)) * _unit(json, kind, where, zero=value == 0)
     total = np.zeros(n)
     for k, drift in enumerate(_list(json.get("drifts"), f"{where}.drifts")):
         place = f"{where}.drifts[{k}]"
@@ -194,7 +240,7 @@ def _values(json: Any, n: int, kind: str, where: str) -> tuple[float, Array]:
         if not _is_known(drift, place):
             continue
         if drift.get("value") is None:
-            raise InputError(f"{place} keeps its values in the file {drift.get('file')!r}; put them into 'value'")
+            continue  # null: not relevant
         factor = _unit({"unit": json.get("unit"), **drift}, kind, place, zero=False)
         steps = factor * numbers(_list(drift["value"], place, alone=(int, float)), (-1,), place)
         if not len(steps):
@@ -206,7 +252,8 @@ def _values(json: Any, n: int, kind: str, where: str) -> tuple[float, Array]:
 
 
 def _constant(json: Mapping[str, Any], name: str, n: int, kind: str, where: str) -> float:
-    if json.get(name) is None:
+    entry = json.get(name)
+    if entry is None or (isinstance(entry, Mapping) and entry.get("value") is None):
         raise InputError(f"{where}.{name} is missing")
     value, drift = _values(json[name], n, kind, f"{where}.{name}")
     if drift.any():

@@ -19,7 +19,9 @@ from tomopose.exports.leap import to_leap
 from tomopose.exports.openct import to_openct
 from tomopose.exports.panel import Rows, check_rows
 from tomopose.exports.pyronn import to_pyronn
+from tomopose.exports.robot_json import to_robot_json
 from tomopose.exports.rtk import to_rtk
+from tomopose.exports.rx_views import to_rx_views
 from tomopose.exports.tigre import to_tigre
 from tomopose.files import atomic_folder, plain, read_json, write_json
 from tomopose.geometry.projection import ProjectionMatrices
@@ -78,6 +80,13 @@ def _write_rtk(folder: Path, m: ProjectionMatrices, rows: Rows) -> Sequence[str]
 def _write_cera(folder: Path, m: ProjectionMatrices, rows: Rows) -> Sequence[str]:
     config, table = to_cera(m, image_rows=image_rows(m))
     return _text(folder, {"cera.config": config, TABLE_NAME: table})
+
+
+def _write_thd(folder: Path, m: ProjectionMatrices, rows: Rows) -> Sequence[str]:
+    (folder / "thd").mkdir()
+    digits = len(str(len(m) - 1))
+    views = {f"thd/view_{k:0{digits}d}.json": _json_text(view) for k, view in enumerate(to_robot_json(m))}
+    return _text(folder, views)
 
 
 def image_rows(matrices: ProjectionMatrices) -> Rows:
@@ -144,8 +153,22 @@ FORMATS: Mapping[str, Format] = {
         contents="projection_matrices (n, 3, 4), mm to px, |P[2, :3]| = 1, w > 0",
         load="geometry.set_trajectory(numpy.load('pyronn.npz')['projection_matrices']); also CONRAD",
     ),
+    "thd": Format(
+        write=_write_thd,
+        contents="one JSON a view: focal spot, detector centre and quaternion (x, y, z, w) in W, mm; pitch and size",
+        load="the robot-CT exchange format of THD Deggendorf",
+        row0="files",
+        rows_note="the detector's second axis points up the panel; image files have their top row first",
+    ),
+    "rx": Format(
+        write=lambda folder, m, rows: _text(folder, {"geom.csv": to_rx_views(m)}),
+        contents="source, panel centre and the middles of the panel's upper and right edges a view, in W, mm",
+        load="geom.csv of RX Solutions; readers for CIL take it with the images' size",
+        row0="files",
+        rows_note="top and right lie on the outer edges of the panel; image files have their top row first",
+    ),
 }
-"""The nine formats, in the order of the manifest."""
+"""The formats, in the order of the manifest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +195,7 @@ def export(
     ----------
     matrices: points of W (mm) to pixels of D.
     out:      the folder; made where absent, files of the same name replaced only with `force`.
-    formats:  names out of astra, rtk, leap, tigre, cil, cera, openct, ctsimu, pyronn; or "all".
+    formats:  names out of astra, rtk, leap, tigre, cil, cera, openct, ctsimu, pyronn, thd, rx; or "all".
     rows:     row 0 of the arrays that go with the geometry: "bottom" (array row index = v) or "top".  rtk and tigre
               know only "bottom"; cera, openct and ctsimu state their own direction.  The manifest says it per format.
 
@@ -207,6 +230,12 @@ def export(
     return Exported(folder=out, files=files, refused=refused, provenance=made)
 
 
+def is_inside(name: str) -> bool:
+    """Whether a name in a manifest is that of a file in the export's own folder."""
+    path = Path(name)
+    return not path.is_absolute() and ".." not in path.parts and bool(path.name)
+
+
 def _files_of(out: Path) -> set[str]:
     """The files that an earlier export into this folder made; empty where its manifest cannot be read."""
     try:
@@ -215,7 +244,7 @@ def _files_of(out: Path) -> set[str]:
         return set()
     entries = formats.values() if isinstance(formats, Mapping) else ()
     files = [e["files"] for e in entries if isinstance(e, Mapping) and isinstance(e.get("files"), Mapping)]
-    return {str(name) for names in files for name in names if Path(str(name)).name == name}
+    return {str(name) for names in files for name in names if is_inside(str(name))}
 
 
 def _named(formats: Sequence[str] | str) -> list[str]:

@@ -71,10 +71,23 @@ def to_openct(matrices: ProjectionMatrices) -> dict[str, Any]:
             "mirrorDetectorAxis": "",
             "skipAngle": 0,
             "totalAngle": None,
-            "objectBoundingBox": None,
+            "objectBoundingBox": _bounding_box(m),
         },
         "corrections": None,
     }
+
+
+def _bounding_box(m: ProjectionMatrices) -> dict[str, Any]:
+    """The cube of W, centred, that all views see: what readers of the format make their volume from.
+
+    Its half side is the panel's half height or width, whichever is smaller, at the depth of W's origin; 1 mm where that
+    depth is not in front of the source.
+    """
+    depth = np.abs(m.P[:, 2, 3])
+    focal = np.linalg.norm(np.cross(m.P[:, 0, :3], m.P[:, 2, :3]), axis=1)
+    seen = np.minimum(m.n_u, m.n_v * m.p_v / m.p_u) * depth / focal
+    side = float(seen.min()) or 1.0
+    return {"centerXYZ": [0.0, 0.0, 0.0], "sizeXYZ": [side, side, side]}
 
 
 def from_openct(content: Mapping[str, Any], given: Given, *, where: str = "the openCT file") -> ProjectionMatrices:

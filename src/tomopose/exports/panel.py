@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -34,7 +35,10 @@ def check_rows(rows: object) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Given:
-    """What the caller knows beside the file: detector size (px), pitch (mm), row order, names of the views."""
+    """What the caller knows beside the file: detector size (px), pitch (mm), row order, names of the views.
+
+    folder: where the file lies, for other files that it names.
+    """
 
     n_u: int | None = None
     n_v: int | None = None
@@ -42,10 +46,15 @@ class Given:
     p_v: float | None = None
     rows: Rows | None = None
     pose_id: tuple[str, ...] | None = None
+    folder: Path | None = None
 
     def __post_init__(self) -> None:
         if self.rows is not None:
             check_rows(self.rows)
+
+    def with_values(self, **values: Any) -> Given:
+        """The same with some values settled."""
+        return replace(self, **values)
 
     def settle(self, name: str, found: Any, where: str) -> Any:
         """The value of n_u, n_v, p_u, p_v or rows from the file (`found`, or None) and from the caller.
@@ -63,7 +72,10 @@ class Given:
         if given is not None:
             same = abs(found - given) <= PITCH_TOLERANCE * given if name in ("p_u", "p_v") else found == given
             if not same:
-                raise InputError(f"{name} is {found!r} in {where}, but {given!r} was given ({OPTIONS[name]})")
+                raise InputError(
+                    f"{name} is {found!r} in {where}, but {given!r} was given ({OPTIONS[name]}); leave it out, or "
+                    "correct it"
+                )
         return found
 
     def matrices(self, P: Any, *, n_u: int, n_v: int, p_u: float, p_v: float) -> ProjectionMatrices:

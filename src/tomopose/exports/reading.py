@@ -3,34 +3,33 @@
 A file that tomopose exported is recognised by the manifest.json beside it (same SHA-256), which then supplies detector
 size, pitch, row order and names of the views, so that nothing is typed twice.  Other files need them as options where
 the format does not hold them; a missing one is an error that names the option, and so is one that contradicts the file.
+Numbers in another unit and mirrored images are caught here, not when they are exported again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from tomopose.errors import ConventionError, FileError, InputError, SchemaVersionError
-from tomopose.exports.astra import from_astra
-from tomopose.exports.cera import cera_config, from_cera
-from tomopose.exports.cil import from_cil
-from tomopose.exports.ctsimu import from_ctsimu
+from tomopose.errors import ConventionError, FileError, InputError, SchemaVersionError, UnknownKindError
+from tomopose.exports.content import load
 from tomopose.exports.folder import FORMATS, MANIFEST
-from tomopose.exports.leap import from_leap
-from tomopose.exports.openct import from_openct
+from tomopose.exports.import_checks import require_millimetres, require_unmirrored, scaled_to_mm
+from tomopose.exports.kinds import READERS, Source, format_of
 from tomopose.exports.panel import Given, Rows
-from tomopose.exports.pyronn import from_pyronn
-from tomopose.exports.rtk import from_rtk
-from tomopose.exports.tigre import from_tigre
-from tomopose.files import read_json
+from tomopose.exports.robot_json import is_robot_json
+from tomopose.files import natural_key, read_json
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.provenance import sha256
-from tomopose.reading import parse_json, read_text, reader, reading, require_file, require_inside
-from tomopose.reading.arrays import MAGIC, ZIP_MAGIC, read_npy, read_npz
+from tomopose.reading import reader, require_file, require_inside
+
+KNOWN = ", ".join([*FORMATS, "matrices"])
+STATE_THEIR_UNIT = ("openct", "ctsimu", "thd")
+"""Formats whose files name the unit of their lengths: what looks like another unit is then a rare geometry."""
+HOLD_THEIR_PITCH = ("astra", "leap", "tigre", "cil", "rx", "thd")
+"""Formats whose own numbers give the pitch, in their own unit."""
 
 
 @reader("geometry file", folder=True)
@@ -44,134 +43,98 @@ def read_geometry(
     p_v: float | None = None,
     rows: Rows | None = None,
     side: Path | str | None = None,
+    unit_mm: float | None = None,
+    mirrored: bool = False,
 ) -> ProjectionMatrices:
     """Projection matrices, points of W (mm) to pixels of D, of a geometry file of another package.
 
     Parameters
     ----------
     path:     an RTK XML, ASTRA .npy, CERA .config (or its table), openCT or CTSimU JSON, the npz (or JSON of the same
-              keys) of leap, tigre, cil or pyronn; or the manifest.json or folder of an export.
+              keys) of leap, tigre, cil or pyronn; bare matrices (n, 3, 4) as .npy, .mat or text of twelve numbers a
+              row; robot-CT JSON (a view, or a folder of views); geom.csv of RX Solutions; or the manifest.json or
+              folder of an export.
     format:   its name; without it the content must be unmistakable.  Of an export folder: which file (default: first).
     n_u, n_v: detector size, px.  p_u, p_v: pitch, mm.  Needed where the file does not hold them.
     rows:     which detector row is row 0 of the arrays the geometry was made for; "bottom": v = r, "top":
-              v = n_v - 1 - r.  astra, leap and pyronn need it.  rtk and tigre state it themselves and refuse a
-              contradiction.  cil, cera, openct and ctsimu count v upwards by definition or name their own frame: it
-              changes nothing there.
+              v = n_v - 1 - r.  astra, leap, pyronn and bare matrices need it.  rtk and tigre state it themselves and
+              refuse a contradiction.  cil, cera, openct, ctsimu, thd and rx count v upwards by definition or name their
+              own frame: it changes nothing there.
     side:     rtk.json of an RTK XML: origin (mm) of pixel (0, 0), spacing, world axes.
+    unit_mm:  what one unit of the file is, mm; without it mm are taken, and numbers that cannot be are refused.
+    mirrored: the images are mirror images, seen from the source, and that is right.
 
     Raises
     ------
-    FileError where a file cannot be read, SchemaVersionError for a newer one, InputError for everything else: a missing
-    or contradicting option, a count that does not match, a value that is not finite.
+    FileError where a file cannot be read, UnknownKindError where its format is not certain, SchemaVersionError for a
+    newer one, UnitError for another unit, InputError for everything else: a missing or contradicting option, a count
+    that does not match, a value that is not finite, mirrored images.
     """
     path = Path(path)
-    if path.is_dir() or path.name == MANIFEST:
-        path, format = _file_of_export(path if path.is_dir() else path.parent, format)
-    elif not path.exists():
-        raise FileError(f"{path} does not exist", path=path)
-    if format is not None and format not in FORMATS:
-        raise ConventionError(f"unknown format {format!r}; known are {', '.join(FORMATS)}")
+    if path.is_dir() and not (path / MANIFEST).is_file():
+        content, record = _views_of_folder(path), _record_of(path)
+    else:
+        if path.is_dir() or path.name == MANIFEST:
+            path, format = _file_of_export(path if path.is_dir() else path.parent, format)
+        content, record = None, _record_of(path)
+    if format is not None and format not in READERS:
+        raise ConventionError(f"unknown format {format!r}; known are {KNOWN}")
     given = Given(n_u=n_u, n_v=n_v, p_u=p_u, p_v=p_v, rows=rows)
-    record = _record_of(path)
     if record is not None:
         given = _filled(given, record, path, format)
     if side is None and record is not None and "rtk.json" in record.siblings:
         side = path.parent / "rtk.json"
         require_described(side, record.manifest["formats"][record.format]["files"]["rtk.json"])
-    content = _load(path)
-    found = _format_of(content)
-    if format is not None and found is not None and format != found:
+    if content is None:
+        content = _views_of_folder(path) if path.is_dir() else load(path)
+    name = _name(content, format, path)
+    source = Source(content=content, path=path, side=None if side is None else Path(side))
+    if unit_mm is not None and name in HOLD_THEIR_PITCH:  # the file's own pitch is in its own unit
+        inner = given.with_values(
+            p_u=None if given.p_u is None else given.p_u / unit_mm,
+            p_v=None if given.p_v is None else given.p_v / unit_mm,
+        )
+    else:
+        inner = given
+    matrices = READERS[name].read(source, inner)
+    if unit_mm is None:
+        if record is None and name not in STATE_THEIR_UNIT:
+            require_millimetres(matrices, str(path))
+    else:
+        matrices = scaled_to_mm(matrices, unit_mm, scale_pitch=name in HOLD_THEIR_PITCH)
+    if record is None and not mirrored:
+        require_unmirrored(matrices, str(path), rows=given.rows)
+    return matrices
+
+
+def _name(content: Any, format: str | None, path: Path) -> str:
+    """The format's name; ConventionError where the file is of another one than the caller says."""
+    found = format_of(content)
+    if format is None:
+        if found is None:
+            raise UnknownKindError(
+                f"the format of {path} cannot be determined from its content; give it (--format); known are {KNOWN}",
+                path=path,
+            )
+        return found
+    # Twelve numbers a row can be vectors or matrices: there the caller's word decides.
+    if found is not None and format != found and {format, found} != {"astra", "matrices"}:
         raise ConventionError(f"{path} is a file of format {found}, not {format}")
-    name = format or found
-    if name is None:
-        raise ConventionError(
-            f"the format of {path} cannot be told from its content; give it (--format); known are {', '.join(FORMATS)}"
+    return format
+
+
+def _views_of_folder(folder: Path) -> list[Any]:
+    """The views of a robot scanner in a folder, one JSON each, in the order of their names."""
+    files = sorted(folder.glob("*.json"), key=lambda p: natural_key(p.name))
+    views = [load(f) for f in files]
+    if not views or not all(is_robot_json(v) for v in views):
+        raise FileError(
+            f"{folder} is a folder without {MANIFEST} and without the views (JSON) of a robot scanner; give the "
+            "geometry's "
+            "file",
+            path=folder,
         )
-    if name == "rtk":
-        return _read_rtk(content, given, side, path)
-    if name == "cera":
-        return _read_cera(content, given, path)
-    _require_kind(content, np.ndarray if name == "astra" else Mapping, name, path)
-    return _FROM[name](content, given, where=str(path))
-
-
-_FROM: Mapping[str, Callable[..., ProjectionMatrices]] = {
-    "astra": from_astra,
-    "leap": from_leap,
-    "tigre": from_tigre,
-    "cil": from_cil,
-    "openct": from_openct,
-    "ctsimu": from_ctsimu,
-    "pyronn": from_pyronn,
-}
-
-
-def _load(path: Path) -> Any:
-    """Content by the file's first bytes: an array, a mapping of arrays, a JSON object or text."""
-    require_file(path, "geometry file")
-    with reading(path, "geometry file"), open(path, "rb") as stream:
-        head = stream.read(6)
-    if head == MAGIC:
-        return read_npy(path, "geometry file")
-    if head[:4] == ZIP_MAGIC:
-        return read_npz(path, "geometry file")
-    text = read_text(path)
-    return parse_json(text, path, constants=True) if text.lstrip().startswith("{") else text
-
-
-def _format_of(content: Any) -> str | None:
-    """The format, from unmistakable content only; None where there is doubt."""
-    if isinstance(content, np.ndarray):
-        return "astra" if content.ndim == 2 and content.shape[1] == 12 else None
-    if isinstance(content, str):
-        if "<RTKThreeDCircularGeometry" in content:
-            return "rtk"
-        is_cera = content.startswith(("projtable.txt version", "#CERACONFIG")) or "ProjectionMatrixFilename" in content
-        return "cera" if is_cera else None
-    if "OpenCTJSON" in content:
-        return "openct"
-    file = content.get("file")
-    if isinstance(file, Mapping) and file.get("file_type") == "CTSimU Scenario":
-        return "ctsimu"
-    telling = {"leap": "module_centers", "tigre": "rotDetector", "cil": "direction_x", "pyronn": "projection_matrices"}
-    matches = [name for name, key in telling.items() if key in content]
-    return matches[0] if len(matches) == 1 else None
-
-
-def _require_kind(content: Any, kind: Any, format: str, path: Path) -> None:
-    if not isinstance(content, kind):
-        raise ConventionError(f"{path} is no file of format {format}")
-
-
-def _read_text(path: Path) -> str:
-    content = _load(path)
-    _require_kind(content, str, "cera", path)
-    return str(content)
-
-
-def _read_rtk(content: Any, given: Given, side: Path | str | None, path: Path) -> ProjectionMatrices:
-    _require_kind(content, str, "rtk", path)
-    if side is None:
-        raise InputError(
-            f"{path}: an RTK geometry does not hold where pixel (0, 0) lies; give side (--side rtk.json), a JSON with "
-            '"origin": [ox, oy] and "spacing": [p_u, p_v] in mm and, unless it is W to (y, z, x), "world_to_rtk"'
-        )
-    data = _load(Path(side)) if Path(side).exists() else None
-    if not isinstance(data, Mapping):
-        raise FileError(f"{side} does not exist or holds no JSON object", path=side)
-    return from_rtk(content, data, given, where=str(path))
-
-
-def _read_cera(content: Any, given: Given, path: Path) -> ProjectionMatrices:
-    _require_kind(content, str, "cera", path)
-    if content.startswith("projtable.txt"):
-        return from_cera(content, given, where=str(path))
-    # The names in a .config come from Windows: both kinds of separators occur.
-    name = PureWindowsPath(cera_config(content, where=str(path))[1])
-    table = require_inside(path.parent, name.name if name.anchor else str(name), str(path))
-    if not table.is_file():
-        raise FileError(f"{path} names the table {table.name}, but {table} does not exist", path=table)
-    return from_cera(_read_text(table), given, config=content, where=str(path))
+    return views
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,7 +164,7 @@ def _manifest(folder: Path) -> Mapping[str, Any]:
 
 
 def _record_of(path: Path) -> _Record | None:
-    """The manifest's entry for this very file, or None where no manifest beside it names it.
+    """The manifest's entry for this very file (or for a folder of its files); None where no manifest names it.
 
     FileError where the manifest names it with another SHA-256: the file was changed, or belongs to another export.
     """
@@ -212,11 +175,13 @@ def _record_of(path: Path) -> _Record | None:
         manifest = _manifest(path.parent)
     except SchemaVersionError:
         return None  # another program's manifest.json: it says nothing about this file
-    for name, entry in manifest["formats"].items():
-        if path.name in entry["files"]:
-            require_described(path, entry["files"][path.name])
+    for format, entry in manifest["formats"].items():
+        mine = [f for f in entry["files"] if f == path.name or f.startswith(f"{path.name}/")]
+        for name in mine:
+            require_described(path.parent / name, entry["files"][name])
+        if mine:
             return _Record(
-                manifest=manifest, format=name, row0=entry.get("row0", "bottom"), siblings=frozenset(entry["files"])
+                manifest=manifest, format=format, row0=entry.get("row0", "bottom"), siblings=frozenset(entry["files"])
             )
     return None
 
@@ -250,8 +215,9 @@ def _file_of_export(folder: Path, format: str | None) -> tuple[Path, str]:
     name = format or next(iter(formats), "")
     if name not in formats:
         raise InputError(f"{folder} holds no format {name!r}; it holds {', '.join(formats) or 'none'}")
-    path = folder / next(iter(formats[name]["files"]))
-    if not path.is_file():
+    first = next(iter(formats[name]["files"]))
+    path = folder / first.split("/")[0]
+    if not (folder / first).is_file():
         raise FileError(f"{folder / MANIFEST} names {path.name}, but it does not exist", path=path)
     for sibling, digest in formats[name]["files"].items():
         require_described(folder / sibling, digest)

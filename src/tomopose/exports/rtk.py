@@ -14,15 +14,16 @@ size nor axes: rtk.json does.  Source: RTK, ThreeDCircularProjectionGeometry; S.
 from __future__ import annotations
 
 import difflib
+import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from tomopose.errors import ConventionError, InputError, SchemaVersionError
+from tomopose.errors import ConventionError, InputError, InputWarning, SchemaVersionError
 from tomopose.exports.euler import zxy_angles
-from tomopose.exports.panel import Given, numbers, unmirrored_panels
+from tomopose.exports.panel import OPTIONS, Given, numbers, unmirrored_panels
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.geometry.rotations import R_x, R_y, R_z
 from tomopose.units import Array, float_array
@@ -43,6 +44,10 @@ PARAMETERS = (
 )
 IGNORED = ("CollimationUInf", "CollimationUSup", "CollimationVInf", "CollimationVSup")
 XML_VERSION = "3"
+READABLE_VERSIONS = ("2", "3")
+"""RTK's own reader takes both."""
+MISSPELT = 0.85
+"""Likeness to a known name (difflib) above which an unknown element is a slip of the pen, and not an addition."""
 SIDE_KEYS = ("world_to_rtk", "origin", "spacing", "direction", "size")
 CROSS_CHECK_TOLERANCE_PX = 1e-3
 """Largest difference, px, between a stored matrix and the one of its parameters before the file is refused."""
@@ -75,14 +80,15 @@ def to_rtk(matrices: ProjectionMatrices) -> tuple[str, dict[str, Any]]:
 
 
 def from_rtk(
-    text: str, side: Mapping[str, Any], given: Given, *, where: str = "the RTK geometry"
+    text: str, side: Mapping[str, Any] | None, given: Given, *, where: str = "the RTK geometry"
 ) -> ProjectionMatrices:
     """Matrices of an RTK XML text and its side data (`origin`, `spacing`, optional `world_to_rtk`,
-    `direction`, `size`).
+    `direction`, `size`).  Without side data, size and pitch must be given, and the panel is centred.
 
     A view may hold parameters, a matrix or both; where it holds both they are checked against each other.  `given`
     must hold n_u, n_v where `size` is absent.  A row order that contradicts `direction` is refused.
     """
+    side = side or _centred(given, where)
     unknown = [k for k in side if k not in SIDE_KEYS and difflib.get_close_matches(k, SIDE_KEYS, cutoff=0.75)]
     origin, spacing, size, direction = (_pair(side, k) for k in ("origin", "spacing", "size", "direction"))
     if unknown or origin is None:
@@ -103,6 +109,20 @@ def from_rtk(
     to_px = float_array(np.linalg.inv(_to_detector_mm(bottom, (p_u, p_v))))
     M = np.stack([_view(k, view, to_px, where) for k, view in enumerate(_views(text, where))])
     return given.matrices(to_px @ M @ _homogeneous(world), n_u=n_u, n_v=n_v, p_u=p_u, p_v=p_v)
+
+
+def _centred(given: Given, where: str) -> dict[str, Any]:
+    """Side data of a panel whose middle is RTK's detector origin: what size and pitch alone determine."""
+    missing = [OPTIONS[k] for k in ("n_u", "n_v", "p_u", "p_v") if getattr(given, k) is None]
+    if missing:
+        raise InputError(
+            f"{where}: an RTK geometry does not hold where pixel (0, 0) lies; give the panel's size and pitch "
+            f"({', '.join(missing)} missing), and the panel is taken as centred; or give side (--side rtk.json), a "
+            "JSON "
+            'with "origin": [ox, oy] and "spacing": [p_u, p_v] in mm and, unless it is W to (y, z, x), "world_to_rtk"'
+        )
+    n_u, n_v, p_u, p_v = (given.settle(k, None, where) for k in ("n_u", "n_v", "p_u", "p_v"))
+    return {"origin": [-(n_u - 1) / 2 * p_u, -(n_v - 1) / 2 * p_v], "spacing": [p_u, p_v]}
 
 
 def matrix_of_parameters(p: Mapping[str, Any]) -> Array:
@@ -170,32 +190,45 @@ def _views(text: str, where: str) -> list[dict[str, Any]]:
     if root.tag != "RTKThreeDCircularGeometry":
         raise InputError(f"{where}: the root element is <{root.tag}>, not <RTKThreeDCircularGeometry>")
     version = root.get("version")
-    if version != XML_VERSION:
-        raise SchemaVersionError(f"{where}: RTK geometry version {version!r}; version {XML_VERSION} is read")
+    if version not in READABLE_VERSIONS:
+        raise SchemaVersionError(
+            f"{where}: RTK geometry version {version!r}; versions {' and '.join(READABLE_VERSIONS)} are read"
+        )
     current: dict[str, float] = dict.fromkeys(PARAMETERS[2:], 0.0)
     views: list[dict[str, Any]] = []
+    added: dict[str, None] = {}
     for element in root:
         if element.tag != "Projection":
-            _take(element, current, where)
+            _take(element, current, added, where)
             continue
         matrix = None
         for child in element:
             if child.tag == "Matrix":
                 matrix = numbers((child.text or "").split(), (12,), f"{where}: Matrix of view {len(views)}")
             else:
-                _take(child, current, where)
+                _take(child, current, added, where)
         views.append({**current, "Matrix": None if matrix is None else matrix.reshape(3, 4)})
     if not views:
         raise InputError(f"{where} holds no <Projection>")
+    if added:
+        warnings.warn(
+            f"{where}: RTK knows no element <{'>, <'.join(added)}>; passed over, as RTK does",
+            InputWarning,
+            stacklevel=2,
+        )
     return views
 
 
-def _take(element: ET.Element, current: dict[str, float], where: str) -> None:
-    """One parameter element into the current values."""
+def _take(element: ET.Element, current: dict[str, float], added: dict[str, None], where: str) -> None:
+    """One parameter element into the current values; a name that RTK does not know goes to `added`."""
     if element.tag in IGNORED:
         return
     if element.tag != "RadiusCylindricalDetector" and element.tag not in PARAMETERS:
-        raise InputError(f"{where}: unknown element <{element.tag}>")
+        near = difflib.get_close_matches(str(element.tag), PARAMETERS, n=1, cutoff=MISSPELT)
+        if near:
+            raise InputError(f"{where}: unknown element <{element.tag}>; did you mean <{near[0]}>?")
+        added[str(element.tag)] = None
+        return
     value = float(numbers((element.text or "").strip(), (), f"{where}: <{element.tag}>"))
     if element.tag == "RadiusCylindricalDetector":
         if value != 0:

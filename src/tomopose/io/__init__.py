@@ -2,6 +2,7 @@
 
 from tomopose.io.calibration_json import read_calibration, write_calibration
 from tomopose.io.foreign.pi_gcs import read_gcs_log
+from tomopose.io.foreign.reading import read_pose_log, read_scanner_draft
 from tomopose.io.images import ImageSequence, RawLayout, open_images, write_hdf5, write_tiff
 from tomopose.io.matrices_npz import read_matrices, write_matrices
 from tomopose.io.notices import InputWarning
@@ -20,8 +21,10 @@ __all__ = [
     "read_gcs_log",
     "read_matrices",
     "read_observations",
+    "read_pose_log",
     "read_poses",
     "read_scanner",
+    "read_scanner_draft",
     "write_calibration",
     "write_hdf5",
     "write_matrices",

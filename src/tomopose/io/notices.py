@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
+from tomopose.errors import InputWarning
 
-class InputWarning(UserWarning):
-    """A file was read, but something in it should be looked at."""
+__all__ = ["InputWarning"]

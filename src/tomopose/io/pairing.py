@@ -9,7 +9,8 @@ from pathlib import PurePath
 import numpy as np
 
 from tomopose.errors import InputError
-from tomopose.io.images.frames import missing_numbers, natural_key, numbers_in_names
+from tomopose.files import natural_key
+from tomopose.io.images.frames import missing_numbers, numbers_in_names
 from tomopose.io.images.sequence import ImageSequence
 from tomopose.manipulator.poses import PoseSequence
 

@@ -3,6 +3,7 @@
 A log of replies is read by this grammar; blank lines and lines that begin with # are skipped:
 
     log    = { query reply } | { reply }         without any query line the replies are those of POS?
+    line   = [time stamp] [">>" | "<<" | "TX:"]  what a terminal writes before each line
     query  = [">"] NAME "?" [arguments]          POS? MOV? SPI? KEN? KLN? KLS? *IDN? and others, one a line
     reply  = { line }                            up to the next query or command
     POS?   : X= Y= Z= U= V= W=                   where the encoders say that the plate stands; one or several on a line
@@ -14,6 +15,8 @@ next.  Axes A and B, which are no axes of the plate, are passed over.  Other que
 SPI?, KEN?, KLN?, KLS? or *IDN? changes, or a command that changes the coordinate system, the pivot or the reference
 stands between the poses (SPI, KEN, KSD, KSF, KST, KSW, KLN, KLD, FRF), the log is refused, since its poses then
 belong to two systems.
+
+A list of MOV commands without any reply gives the set poses; remarks `; pose_id NAME` and `; table to X deg` name them.
 
 A recording is a table (tabs, semicolons or commas) with the columns X Y Z U V W, optionally X_set ... W_set and the
 columns alpha_deg, image, ball_id, time_utc, pose_id and comment lines of poses.csv.
@@ -27,6 +30,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tomopose.errors import InputError
+from tomopose.io.foreign.clock_words import iso_words, seconds_of
+from tomopose.io.foreign.foreign_file import ForeignFile
+from tomopose.io.foreign.kind import Kind
+from tomopose.io.foreign.pose_log import PoseLog, PoseOptions, Row
+from tomopose.io.foreign.program_remarks import Remarks
 from tomopose.io.poses_csv import poses_from_table
 from tomopose.io.table_text import NUMBER, TextTable, read_table, read_text
 from tomopose.manipulator.poses import PoseSequence
@@ -38,15 +46,22 @@ OTHER_AXES = ("A", "B")
 PIVOT_AXES = (("R", "S", "T"), ("X", "Y", "Z"))
 SETTLED = ("SPI?", "KEN?", "KLN?", "KLS?", "*IDN?")
 CHANGING = ("SPI", "KEN", "KSD", "KSF", "KST", "KSW", "KLN", "KLD", "FRF")
+STAMP = re.compile(
+    r"^\s*\[?(?P<stamp>(?:\d{4}-\d{2}-\d{2}[ T]|\d{2}\.\d{2}\.\d{4} )?\d{1,2}:\d{2}:\d{2}(?:[.,]\d+)?)\]?[,;\s]+"
+)
+DIRECTION = re.compile(r"^(>>|<<|->|<-|(?:TX|RX|SEND|SENT|RECV|RECEIVED)\b:?)\s*", re.IGNORECASE)
 LINE_OF_QUERY = re.compile(r">?\s*(\*?[A-Z]{3}\?)(\s.*)?")
 LINE_OF_COMMAND = re.compile(r">?\s*([A-Z]{3})(\s.*)?")
 ASSIGNMENT = re.compile(r"([A-Z])\s*=\s*(\S+)")
+MOVE = re.compile(r">?\s*MOV\s+(?P<rest>[A-Z]\s.*)")
+PIVOT_COMMAND = re.compile(r">?\s*SPI\s+(?P<rest>[A-Z]\s.*)")
 
 
 @dataclass(kw_only=True)
 class _Reply:
     query: str
     line: int
+    stamp: str | None = None
     values: dict[str, str] = field(default_factory=dict)
     text: list[str] = field(default_factory=list)
 
@@ -64,20 +79,103 @@ def read_gcs_log(path: str | Path, *, units_confirmed: bool = False) -> PoseSequ
     first = next((line for line in read_text(path).splitlines() if line.strip() and line.lstrip()[0] != "#"), "")
     if all(re.search(rf"(^|[\t;,])\s*\"?{axis}\"?\s*($|[\t;,])", first) for axis in AXES):
         return poses_from_table(_renamed(read_table(path)), units_confirmed=units_confirmed)
-    replies = _replies(path)
-    poses = _pair(path, replies)
-    columns: dict[str, list[str]] = {"pose_id": [str(k) for k in range(len(poses))]}
-    for query, names in (("POS?", COLUMNS), ("MOV?", tuple(_set(c) for c in COLUMNS))):
-        if query in poses[0]:
-            columns |= {c: [p[query].values[a] for p in poses] for c, a in zip(names, AXES, strict=True)}
-    table = TextTable(
-        path=path,
-        comments=_pivot_comment(path, replies),
-        columns=tuple(columns),
-        rows=tuple(zip(*columns.values(), strict=True)),
+    return read(ForeignFile(path), PoseOptions()).poses(units_confirmed=units_confirmed)
+
+
+def recognise(file: ForeignFile) -> bool:
+    """Lines of a controller's replies `X=1.0`, queries POS?, or MOV commands of six axes."""
+    if not file.is_text:
+        return False
+    for line in file.lines[:200]:
+        bare = _bare(line)[1]
+        if re.fullmatch(r"([XYZUVW]\s*=\s*[-+.\deE]+\s*)+", bare) or re.match(r">?\s*(POS|MOV)\?(\s|$)", bare):
+            return True
+        if (move := MOVE.fullmatch(bare)) and set(_arguments(move["rest"])) >= set(AXES):
+            return True
+    return False
+
+
+def read(file: ForeignFile, options: PoseOptions) -> PoseLog:
+    """The poses of a log of replies, or of a list of commands where nothing was replied."""
+    replies = _replies(file)
+    answered = any(r.values for r in replies if r.query in ("POS?", "MOV?"))
+    if not answered and any(MOVE.fullmatch(_bare(line)[1]) for line in file.lines):
+        return _commands(file)
+    poses = _pair(file.path, replies)
+    kinds = poses[0]
+    rows = {q: tuple(tuple(p[q].values[a] for a in AXES) for p in poses) for q in kinds}
+    main = "POS?" if "POS?" in kinds else "MOV?"
+    stamps = [p[main].stamp for p in poses]
+    times = tuple(s for s in stamps if s is not None)
+    timed = seconds_of(times) if len(times) == len(poses) else None
+    return PoseLog(
+        path=file.path,
+        convention="pi-hexapod",
+        rows=rows[main],
+        set_rows=rows.get("MOV?") if main == "POS?" else None,
+        source="encoder" if main == "POS?" else "set",
+        pivot=_pivot(file.path, replies),
+        times=None if timed is None else (iso_words(times) or times),
+        seconds=None if timed is None else timed[0],
+        clock="" if timed is None else timed[1],
         lines=tuple(next(iter(p.values())).line for p in poses),
     )
-    return poses_from_table(table, units_confirmed=units_confirmed)
+
+
+def _commands(file: ForeignFile) -> PoseLog:
+    """The set poses of MOV commands that nobody answered: a list that is still to be sent."""
+    remarks, rows, lines, pivots = Remarks(), [], [], []
+    for number, line in enumerate(file.lines, start=1):
+        remarks.line(line)
+        bare = _bare(line)[1]
+        if pivot := PIVOT_COMMAND.fullmatch(bare):
+            pivots.append((number, _arguments(pivot["rest"])))
+        move = MOVE.fullmatch(bare)
+        if move is None:
+            continue
+        values = _arguments(move["rest"])
+        missing = [a for a in AXES if a not in values]
+        if missing:
+            raise InputError(
+                f"{file.path}: line {number}: the command does not move {', '.join(missing)}; where those axes are is "
+                "not in the file"
+            )
+        rows.append(_words(file.path, number, values))
+        lines.append(number)
+        remarks.pose()
+    if any(number > lines[0] for number, _ in pivots):
+        raise InputError(f"{file.path}: SPI changes the pivot between two poses; split the list there")
+    pivot_words = tuple(pivots[-1][1].get(a, "0") for a in PIVOT_AXES[0]) if pivots else None
+    return PoseLog(
+        path=file.path,
+        convention="pi-hexapod",
+        rows=tuple(rows),
+        source="set",
+        lines=tuple(lines),
+        pivot=pivot_words if pivot_words is None else (pivot_words[0], pivot_words[1], pivot_words[2]),
+        notes=("commands without replies: these are the set poses",),
+        **remarks.columns(),
+    )
+
+
+def _arguments(text: str) -> dict[str, str]:
+    """`X 1 Y 2` as {"X": "1", "Y": "2"}."""
+    words = text.split()
+    return dict(zip(words[0::2], words[1::2], strict=False))
+
+
+def _words(path: Path, number: int, values: Mapping[str, str]) -> Row:
+    for axis in AXES:
+        if not NUMBER.fullmatch(values[axis]):
+            raise InputError(f"{path}: line {number}: {axis} {values[axis]} is no finite number")
+    return tuple(values[a] for a in AXES)
+
+
+def _bare(line: str) -> tuple[str | None, str]:
+    """The time stamp of a terminal's line, and the line without stamp and direction."""
+    stamp = STAMP.match(line)
+    rest = line[stamp.end() :] if stamp else line
+    return (stamp["stamp"] if stamp else None), DIRECTION.sub("", rest.strip()).strip()
 
 
 def _set(column: str) -> str:
@@ -102,24 +200,27 @@ def _renamed(table: TextTable) -> TextTable:
     )
 
 
-def _replies(path: Path) -> list[_Reply]:
+def _replies(file: ForeignFile) -> list[_Reply]:
+    path = file.path
     replies: list[_Reply] = []
     commands: list[tuple[int, str]] = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        line = line.strip()
-        if not line or line.startswith("#"):
+    for number, whole in enumerate(file.lines, start=1):
+        stamp, line = _bare(whole)
+        if not line or line[0] in "#;":
             continue
         if query := LINE_OF_QUERY.fullmatch(line):
-            replies.append(_Reply(query=query[1], line=number))
+            replies.append(_Reply(query=query[1], line=number, stamp=stamp))
             continue
-        current = replies[-1] if replies else _Reply(query="POS?", line=number)
+        current = replies[-1] if replies else _Reply(query="POS?", line=number, stamp=stamp)
         found = ASSIGNMENT.findall(line)
         if found and ASSIGNMENT.sub("", line).strip(" ,;\t") == "" and current.query in ("POS?", "MOV?", "SPI?"):
             if not replies:
                 replies.append(current)
             for axis, value in found:
                 if axis in replies[-1].values:  # the next reply, without a query line before it
-                    replies.append(_Reply(query=current.query, line=number))
+                    replies.append(_Reply(query=current.query, line=number, stamp=stamp))
+                if not replies[-1].values:
+                    replies[-1].stamp = stamp  # the reply's own time, not the question's
                 _take(path, number, replies[-1], axis, value)
         elif command := LINE_OF_COMMAND.fullmatch(line):
             commands.append((number, command[1]))
@@ -186,11 +287,20 @@ def _pair(path: Path, replies: list[_Reply]) -> list[dict[str, _Reply]]:
     return poses
 
 
-def _pivot_comment(path: Path, replies: list[_Reply]) -> dict[str, str]:
+def _pivot(path: Path, replies: list[_Reply]) -> tuple[str, str, str] | None:
     spi = next((r for r in replies if r.query == "SPI?"), None)
     if spi is None:
-        return {}
+        return None
     axes = next((axes for axes in PIVOT_AXES if set(axes) == set(spi.values)), None)
     if axes is None:
         raise InputError(f"{path}: line {spi.line}: the reply to SPI? has {', '.join(spi.values)}; R, S, T are needed")
-    return {"pivot_mm": ", ".join(spi.values[a] for a in axes)}
+    return spi.values[axes[0]], spi.values[axes[1]], spi.values[axes[2]]
+
+
+KIND = Kind(
+    name="pi-gcs",
+    maker="PI",
+    what="a log of a controller's replies (POS?, MOV?, SPI?) or a list of MOV commands",
+    recognise=recognise,
+    read_poses=read,
+)

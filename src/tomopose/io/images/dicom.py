@@ -11,6 +11,7 @@ import numpy as np
 
 from tomopose.errors import FileError, InputError
 from tomopose.io.images.frames import Band, Image, require_grey, require_one_kind
+from tomopose.io.images.stated import Stated
 from tomopose.reading import reading, require_plausible
 
 
@@ -23,6 +24,7 @@ class DicomSource:
     dtype: np.dtype[Any]
     frames: tuple[tuple[Path, int], ...]
     warnings: tuple[str, ...] = ()
+    stated: Stated | None = None
 
     def read(self, index: int, band: Band) -> Image:
         path, k = self.frames[index]
@@ -36,6 +38,7 @@ def open_dicom(paths: list[Path], names: list[str]) -> DicomSource:
     frame_names: list[str] = []
     kinds: list[tuple[str, tuple[int, int], np.dtype[Any]]] = []
     notes: list[str] = []
+    stated: Stated | None = None
     for path, name in zip(paths, names, strict=True):
         with reading(path, "DICOM file"), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # values are converted when they are asked for
@@ -47,6 +50,8 @@ def open_dicom(paths: list[Path], names: list[str]) -> DicomSource:
                 notes.append(
                     f"{name}: the file says that low values are white (MONOCHROME1); values are used as stored"
                 )
+            if stated is None:
+                stated = stated_geometry(data)
             count = int(data.get("NumberOfFrames", 1) or 1)
             _require_room(path, data, count)
             kinds.append((str(path), (int(data.Rows), int(data.Columns)), _dtype(data)))
@@ -55,8 +60,47 @@ def open_dicom(paths: list[Path], names: list[str]) -> DicomSource:
                 frame_names.append(f"{name}[{k}]" if count > 1 else name)
     require_one_kind(kinds)
     return DicomSource(
-        names=tuple(frame_names), shape=kinds[0][1], dtype=kinds[0][2], frames=tuple(frames), warnings=tuple(notes)
+        names=tuple(frame_names),
+        shape=kinds[0][1],
+        dtype=kinds[0][2],
+        frames=tuple(frames),
+        warnings=tuple(notes),
+        stated=stated,
     )
+
+
+SPACINGS = ("ImagerPixelSpacing", "ImagePlanePixelSpacing", "PixelSpacing")
+"""[row, column] spacing, mm: at the panel, at the plane of RTImageSID, or somewhere that the file does not say."""
+DISTANCES = {
+    "d_SD_mm": ("DistanceSourceToDetector", "RTImageSID"),
+    "d_SR_mm": ("RadiationMachineSAD", "DistanceSourceToPatient"),
+}
+
+
+def stated_geometry(data: Any) -> Stated:
+    """Pixel pitch at the panel and distances in a header, mm.  Source: DICOM PS3.3, RT Image, DX and X-ray modules."""
+    values: dict[str, float] = {}
+    fields: dict[str, str] = {}
+    readings: list[str] = []
+    for name in SPACINGS:
+        pair = data.get(name)
+        if pair is None or len(pair) != 2:
+            continue
+        values["p_v_mm"], values["p_u_mm"] = float(pair[0]), float(pair[1])
+        fields |= {"p_u_mm": name, "p_v_mm": name}
+        if name == "ImagePlanePixelSpacing":
+            readings.append("ImagePlanePixelSpacing is taken as that of the panel, at RTImageSID from the source")
+        if name == "PixelSpacing":
+            readings.append("PixelSpacing alone is stated; it is taken as that of the panel")
+        break
+    for key, names in DISTANCES.items():
+        for name in names:
+            value = data.get(name)
+            if value is not None and float(value) > 0:
+                values[key], fields[key] = float(value), name
+                break
+    values = {k: v for k, v in values.items() if np.isfinite(v) and v > 0}
+    return Stated(values=values, fields=fields, readings=tuple(readings))
 
 
 def _require_room(path: Path, data: Any, count: int) -> None:

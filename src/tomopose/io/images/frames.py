@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
-import re
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from tomopose.errors import FileError, InputError
+from tomopose.files import NUMBER_RUN
 
 Image = np.ndarray[Any, np.dtype[Any]]
 Band = tuple[int, int, int, int]
@@ -85,16 +85,6 @@ def require_grey(name: str, dtype: np.dtype[Any], samples: int = 1) -> None:
         )
     if dtype.kind not in "uif" or dtype.itemsize > 8:
         raise InputError(f"{name} holds pixels of type {dtype}; whole numbers or floats are needed")
-
-
-NUMBER_RUN = re.compile(r"(\d+)")
-
-
-def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sort key that counts: pose_2 before pose_10."""
-    return tuple(
-        (0, int(part), part) if part.isdigit() else (1, 0, part.lower()) for part in NUMBER_RUN.split(name) if part
-    )
 
 
 def numbers_in_names(names: tuple[str, ...]) -> list[int] | None:

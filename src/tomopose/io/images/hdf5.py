@@ -10,6 +10,8 @@ import numpy as np
 
 from tomopose.errors import InputError
 from tomopose.io.images.frames import Band, Image, require_grey
+from tomopose.io.images.nexus import DATA, NexusValues, entries, stated_by
+from tomopose.io.images.stated import Stated
 from tomopose.reading import reading
 from tomopose.reading.hdf5 import checked_hdf5
 
@@ -31,6 +33,8 @@ class Hdf5Source:
     darks: tuple[int, ...] = ()
     image_rows: str | None = None
     warnings: tuple[str, ...] = ()
+    stated: Stated | None = None
+    angles_deg: tuple[float, ...] | None = None
 
     def read(self, index: int, band: Band) -> Image:
         return self._read(self.frames[index], band)
@@ -74,6 +78,7 @@ def open_hdf5(path: Path, name: str, dataset: str | None) -> Hdf5Source:
         if frames.size == 0:
             raise InputError(f"{path}: no frame of {where} is a projection (image_key 0)")
         rows = data.attrs.get("image_rows")
+        stated, angles = _facts(file, data, frames)
         return Hdf5Source(
             names=tuple(f"{name}[{k}]" for k in frames),
             shape=(int(data.shape[1]), int(data.shape[2])),
@@ -84,7 +89,18 @@ def open_hdf5(path: Path, name: str, dataset: str | None) -> Hdf5Source:
             flats=tuple(np.flatnonzero(keys == FLAT).tolist()),
             darks=tuple(np.flatnonzero(keys == DARK).tolist()),
             image_rows=None if rows is None else str(rows),
+            stated=stated,
+            angles_deg=angles,
         )
+
+
+def _facts(file: Any, data: Any, frames: Image) -> tuple[Stated | None, tuple[float, ...] | None]:
+    """What an NXtomo entry says of the scan, if the stack is its data: geometry, and the table angle of each frame."""
+    for entry in entries(file):
+        if entry[DATA] == data:
+            angles = NexusValues(entry).angles(len(data))
+            return stated_by(entry), None if angles is None else tuple(angles[frames].tolist())
+    return None, None
 
 
 def _stacks(file: Any) -> list[str]:

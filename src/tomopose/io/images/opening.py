@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import glob
 import os
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tomopose.errors import ConventionError, FileError, InputError
+from tomopose.errors import ConventionError, FileError, InputError, InputWarning
+from tomopose.files import natural_key
 from tomopose.geometry.scanner import Scanner
 from tomopose.io.images.checks import endianness_note, require_scanner_shape
 from tomopose.io.images.correction import correction, require_uncorrected
 from tomopose.io.images.dicom import open_dicom
-from tomopose.io.images.frames import FrameSource, Image, missing_numbers, natural_key
+from tomopose.io.images.frames import FrameSource, Image, missing_numbers
 from tomopose.io.images.hdf5 import Hdf5Source, open_hdf5
+from tomopose.io.images.orientation import TURNS, UprightSource
 from tomopose.io.images.raw import RawLayout, open_raw
 from tomopose.io.images.sequence import ImageSequence, Rows
+from tomopose.io.images.stated import contradictions
 from tomopose.io.images.tiff import open_tiff
 
 SUFFIXES = {
@@ -98,6 +102,10 @@ def open_images(
         require_scanner_shape(frames.shape, scanner, frames.names[0])
     plain = ImageSequence(source=frames, rows=order, index=tuple(range(len(frames.names))))
     notes = [*getattr(frames, "warnings", ())]
+    stated = getattr(frames, "stated", None)
+    said = "" if scanner is None or stated is None else contradictions(stated, scanner, frames.names[0])
+    if said:
+        warnings.warn(said, InputWarning, stacklevel=2)
     if frames.dtype.itemsize == 1:
         notes.append(f"{frames.names[0]}: 8 bits a pixel; the detector's own 16-bit data measure better")
     gaps = missing_numbers(frames.names)
@@ -206,14 +214,32 @@ def _open(paths: list[Path], kind: str, raw_layout: RawLayout | None, dataset: s
 
 
 def _rows(frames: FrameSource, rows: Rows | None, scanner: Scanner | None) -> Rows:
+    """The row order of the frames as they are handed out: the file's own word first, then the caller's."""
     for value in (rows, getattr(frames, "image_rows", None)):
         if value not in (None, "top-first", "bottom-first"):
             raise ConventionError(f"row order {value!r} is unknown; 'top-first' or 'bottom-first' is needed")
+    if isinstance(frames, UprightSource):
+        _require_same_rows(frames, rows or (scanner.image_rows if scanner is not None else None))
+        return "top-first"
     said: Any = getattr(frames, "image_rows", None)
     if rows is not None and said is not None and rows != said:
         raise ConventionError(f"{frames.names[0]}: the file says that its rows are {said}, rows={rows!r} contradicts")
     order: Rows = rows or said or (scanner.image_rows if scanner is not None else "top-first")
     return order
+
+
+def _require_same_rows(frames: UprightSource, rows: Rows | None) -> None:
+    """ConventionError where the caller says bottom-first and the file's Orientation says that row 0 is the top.
+
+    The default of a scanner is top-first: it cannot be told from a word of the user and contradicts nothing.
+    """
+    row_0 = TURNS[frames.orientation].row_0
+    if rows == "bottom-first" and row_0 != "bottom":
+        raise ConventionError(
+            f"{frames.names[0]}: its Orientation {frames.orientation} says that the first stored row is the {row_0}, "
+            "but "
+            "the rows are said to be bottom-first (--rows or image_rows); one of them is wrong"
+        )
 
 
 def _mask(bad_pixels: Image, shape: tuple[int, int]) -> Image:

@@ -13,10 +13,23 @@ from typing import Any
 import numpy as np
 
 from tomopose.errors import EngineMissingError, FileError, InputError
-from tomopose.io.images.frames import Band, Image, fetch_ahead, read_block, require_grey, require_one_kind, unreadable
+from tomopose.io.images.frames import (
+    Band,
+    FrameSource,
+    Image,
+    fetch_ahead,
+    read_block,
+    require_grey,
+    require_one_kind,
+    unreadable,
+)
+from tomopose.io.images.orientation import TURNS, UPRIGHT, upright
 from tomopose.io.images.tiff_structure import require_sound_tiff
 from tomopose.reading import reading
 
+ORIENTATION, DATE_TIME = 274, 306
+REDUCED_OR_MASK = 1 | 4
+"""Bits of NewSubfileType: a smaller copy of another page, or a transparency mask."""
 LOSSLESS = {1: "none", 5: "LZW", 8: "deflate", 32773: "PackBits", 32946: "deflate", 34925: "LZMA", 50000: "Zstandard"}
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds wrong is said in one error
 PHOTOMETRIC_GREY = (0, 1)
@@ -56,62 +69,126 @@ class TiffSource:
             fetch_ahead(frame.path, frame.offset + r0 * row, (r1 - r0) * row)
 
 
-def open_tiff(paths: list[Path], names: list[str]) -> TiffSource:
-    """The frames of TIFF files, in order.  Every header is read and every file's length checked.
+@dataclass(frozen=True, kw_only=True)
+class TiffPages:
+    """What the headers of a file say: frames and shapes, whether 0 is white, its Orientation, pages passed over."""
 
-    Raises FileError (truncated, empty, no TIFF), InputError (colour, lossy compression, shapes or types that differ).
+    frames: list[TiffFrame]
+    shapes: list[tuple[int, int]]
+    inverted: bool
+    orientation: int
+    thumbnails: int
+
+
+def open_tiff(paths: list[Path], names: list[str]) -> FrameSource:
+    """The frames of TIFF files, in order, upright.  Every header is read and every file's length checked.
+
+    Smaller copies of a page (NewSubfileType) are passed over.  Raises FileError (truncated, empty, no TIFF), InputError
+    (colour, lossy compression, shapes, types or orientations that differ).
     """
     frames: list[TiffFrame] = []
     frame_names: list[str] = []
     kinds: list[tuple[str, tuple[int, int], np.dtype[Any]]] = []
     warnings: list[str] = []
+    turns: list[int] = []
+    inverted, thumbnails = False, 0
     for path, name in zip(paths, names, strict=True):
-        found, shape, inverted = _pages(path)
-        many = len(found) > 1
-        for k, (frame, shape_k) in enumerate(zip(found, shape, strict=True)):
+        pages = _pages(path)
+        turns.append(pages.orientation)
+        many = len(pages.frames) > 1
+        for k, (frame, shape_k) in enumerate(zip(pages.frames, pages.shapes, strict=True)):
             frames.append(frame)
             frame_names.append(f"{name}[{k}]" if many else name)
             kinds.append((f"{path}, page {k}" if many else str(path), shape_k, frame.dtype.newbyteorder("=")))
-        if inverted and not warnings:
+        if pages.inverted and not inverted:
+            inverted = True
             warnings.append(f"{name}: the file says that 0 is white (MinIsWhite); values are used as stored")
+        if pages.thumbnails and not thumbnails:
+            warnings.append(
+                f"{name}: {pages.thumbnails} pages are smaller copies or masks (NewSubfileType); passed over"
+            )
+        thumbnails += pages.thumbnails
     require_one_kind(kinds)
-    return TiffSource(
+    if len(set(turns)) > 1:
+        k = next(k for k, t in enumerate(turns) if t != turns[0])
+        raise InputError(
+            f"{paths[k]} has the Orientation {turns[k]}, {paths[0]} {turns[0]}; all images of a sequence lie one way"
+        )
+    stored = TiffSource(
         names=tuple(frame_names), shape=kinds[0][1], dtype=kinds[0][2], frames=tuple(frames), warnings=tuple(warnings)
     )
+    return stored if turns[0] == UPRIGHT else upright(stored, turns[0])
 
 
-def _pages(path: Path) -> tuple[list[TiffFrame], list[tuple[int, int]], bool]:
-    """Frames and shapes of a file, and whether it says that 0 is white."""
+def date_time(path: Path) -> str | None:
+    """When a TIFF says that it was made (DateTime, tag 306), as `YYYY-MM-DD HH:MM:SS`; None where it does not say."""
     import tifffile
 
+    with reading(path, "TIFF"):
+        require_sound_tiff(path)
+        with tifffile.TiffFile(path) as tif:
+            tag = tif.pages.first.tags.get(DATE_TIME)
+            value = "" if tag is None else str(tag.value)
+    word = value.strip().strip("\0")
+    return f"{word[:10].replace(':', '-')}{word[10:]}" if word[:1].isdigit() else None
+
+
+def _pages(path: Path) -> TiffPages:
+    """What the headers of a file say."""
+    import tifffile
+
+    frames: list[TiffFrame] = []
+    shapes: list[tuple[int, int]] = []
+    inverted, thumbnails, turns = False, 0, []
     with reading(path, "TIFF (truncated?)"):
         size = path.stat().st_size
         if size == 0:
             raise FileError(f"{path} is empty (0 bytes); copy it again", path=path)
         require_sound_tiff(path)
         with tifffile.TiffFile(path) as tif:
-            frames, shapes, inverted = [], [], False
             for k, entry in enumerate(tif.pages):
                 page: Any = entry
+                if int(page.subfiletype) & REDUCED_OR_MASK:
+                    thumbnails += 1
+                    continue
                 _require_usable(path, k, page, size)
                 dtype = np.dtype(page.dtype).newbyteorder(tif.byteorder)
                 plain = page.is_contiguous and page.bitspersample == 8 * dtype.itemsize and page.fillorder == 1
                 frames.append(TiffFrame(path=path, page=k, offset=page.dataoffsets[0] if plain else None, dtype=dtype))
                 shapes.append((page.imagelength, page.imagewidth))
                 inverted |= page.photometric == MIN_IS_WHITE
+                turns.append(_orientation(path, page))
             count = _frames_behind_one_header(tif)
-            if count > 1 and frames[0].offset is not None:
-                step = shapes[0][0] * shapes[0][1] * frames[0].dtype.itemsize
-                start = frames[0].offset
-                frames = [
-                    TiffFrame(path=path, page=k, offset=start + k * step, dtype=frames[0].dtype) for k in range(count)
-                ]
+            if count > 1 and frames and frames[0].offset is not None:
+                frames = _behind(path, frames[0], shapes[0], count, size)
                 shapes *= count
-                if start + count * step > size:
-                    raise _truncated(path, start + count * step, size)
     if not frames:
         raise FileError(f"{path} holds no images", path=path)
-    return frames, shapes, inverted
+    if len(set(turns)) > 1:
+        raise InputError(
+            f"{path}: its pages have different Orientations ({turns[0]}, {next(t for t in turns if t != turns[0])})"
+        )
+    return TiffPages(frames=frames, shapes=shapes, inverted=inverted, orientation=turns[0], thumbnails=thumbnails)
+
+
+def _orientation(path: Path, page: Any) -> int:
+    """The page's Orientation, 1 where it does not say; InputError for a value that TIFF does not know."""
+    tag = page.tags.get(ORIENTATION)
+    value = UPRIGHT if tag is None else int(tag.value)
+    if value == 0:
+        return UPRIGHT  # what writers leave that do not fill the tag
+    if value not in TURNS:
+        raise InputError(f"{path}: the Orientation is {value}; TIFF knows 1 to 8")
+    return value
+
+
+def _behind(path: Path, first: TiffFrame, shape: tuple[int, int], count: int, size: int) -> list[TiffFrame]:
+    """Frames that lie one behind the other after the header of the first."""
+    step = shape[0] * shape[1] * first.dtype.itemsize
+    start = first.offset or 0
+    if start + count * step > size:
+        raise _truncated(path, start + count * step, size)
+    return [TiffFrame(path=path, page=k, offset=start + k * step, dtype=first.dtype) for k in range(count)]
 
 
 def _frames_behind_one_header(tif: Any) -> int:

@@ -1,20 +1,21 @@
 """CTSimU scenarios (format 1.0 to 1.2) as runs of the virtual scanner, and runs as scenarios, as far as both go.
 
-Read: geometry of every frame, voltage, filters, windows, spot, scintillator, grey values, SNR, unsharpness, lag,
-mesh samples on the stage, materials with a formula or mass fractions.  What else a scenario asks for is named in
-`NOT_READ` and refused, never passed over.
+Read: geometry of every frame (drift files too), voltage or spectrum file, filters, windows, spot, scintillator, grey
+values, SNR, unsharpness, lag, mesh samples on the stage, materials with a formula or mass fractions.  What else a
+scenario asks for is named in `NOT_READ` and refused, never passed over.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
 
-from tomopose.errors import InputError
+from tomopose.errors import FileError, InputError
 from tomopose.exports.ctsimu import from_ctsimu, to_ctsimu
 from tomopose.exports.panel import Given
 from tomopose.geometry.frames import Frame
@@ -39,8 +40,7 @@ SIGMA_PER_RESOLUTION = 2 * math.sqrt(math.log(5) / 2) / math.pi
 ANODE_DENSITY = 10.0
 """g/cm3 of an anode whose material is not in the table: no spectrum depends on it."""
 NOT_READ = (
-    ("source", "spectrum", "file"),
-    ("source", "spot", "intensity_map"),
+    ("source", "spot", "intensity_map", "file"),
     ("detector", "unsharpness", "mtf"),
     ("detector", "noise", "noise_characteristics_file"),
     ("detector", "bad_pixel_map", "file"),
@@ -50,12 +50,21 @@ NOT_READ = (
 
 
 def _get(content: Any, *keys: str) -> Any:
-    """A nested entry, None where any step is missing or null."""
+    """A nested entry, None where any step is missing or null; a parameter without number or unit gives its value."""
     for key in keys:
         if not isinstance(content, Mapping) or content.get(key) is None:
             return None
         content = content[key]
+    if isinstance(content, Mapping) and content.keys() <= {"value", "unit"} and content.get("value") is None:
+        return None
     return content
+
+
+def _word(content: Any, *keys: str) -> str | None:
+    """A text parameter, written bare or as {"value": ...}; None where it is missing, null or empty."""
+    entry = _get(content, *keys)
+    entry = entry.get("value") if isinstance(entry, Mapping) else entry
+    return str(entry) if entry not in (None, "", False) else None
 
 
 def _number(content: Any, *keys: str, default: float | None = None) -> float | None:
@@ -76,7 +85,7 @@ def _number(content: Any, *keys: str, default: float | None = None) -> float | N
 
 
 def run_from_ctsimu(content: Mapping[str, Any], *, folder: str | Path = ".", seed: int = 0) -> SimulatedRun:
-    """The run that a scenario's JSON content describes; mesh files are taken from `folder`.
+    """The run that a scenario's JSON content describes; files that it names are taken from `folder`.
 
     InputError for what the virtual scanner does not read, FileError for content that is no scenario.
     """
@@ -88,9 +97,10 @@ def run_from_ctsimu(content: Mapping[str, Any], *, folder: str | Path = ".", see
 
 def _run(content: Mapping[str, Any], folder: Path, seed: int) -> SimulatedRun:
     for path in NOT_READ:
-        if _get(content, *path) not in (None, {}) and _get(content, *path, "file") is not False:
-            raise InputError(f"CTSimU: {'.'.join(path)} is not read by the virtual scanner")
-    scanner, T_MH = _geometry(from_ctsimu(content, Given()))
+        name = _word(content, *path)
+        if name is not None:
+            raise InputError(f"CTSimU: {'.'.join(path)} ({name}) is not read by the virtual scanner")
+    scanner, T_MH = _geometry(from_ctsimu(content, Given(folder=folder)))
     materials = dict(MATERIALS)
     for entry in content.get("materials") or ():
         materials[str(entry["id"])] = _material(entry)
@@ -107,7 +117,7 @@ def _run(content: Mapping[str, Any], folder: Path, seed: int) -> SimulatedRun:
         solids=(),
         meshes=meshes,
         materials=materials,
-        spectrum=_spectrum(content, materials),
+        spectrum=_spectrum(content, materials, folder),
         detector=_detector(content, scanner),
         seed=seed,
         spot=_spot(content),
@@ -178,14 +188,21 @@ def _sample(entry: Mapping[str, Any], folder: Path) -> MeshSolid:
     return MeshSolid(mesh=mesh.placed(R=axes, t=STAGE_TO_M @ centre), material=str(entry.get("material_id")), name=name)
 
 
-def _spectrum(content: Mapping[str, Any], materials: Mapping[str, Material]) -> Spectrum:
+def _spectrum(content: Mapping[str, Any], materials: Mapping[str, Material], folder: Path) -> Spectrum:
     source, detector = content.get("source") or {}, content.get("detector") or {}
     voltage = _number(source, "voltage")
-    if voltage is None:
+    file = _word(source, "spectrum", "file")
+    if voltage is None and file is None:
         raise InputError("CTSimU: source.voltage is missing")
-    if _get(source, "spectrum", "monochromatic"):
+    monochromatic = _get(source, "spectrum", "monochromatic")
+    if file is not None and not monochromatic:
+        # A spectrum's file is that of the tube behind its window: the scenario's plates come on top of it no more.
+        spectrum = _spectrum_file(folder / PureWindowsPath(file).as_posix())
+        source = {**source, "window": None}
+    elif monochromatic:
         spectrum = Spectrum(energy=np.array([voltage]), weight=np.ones(1))
     else:
+        assert voltage is not None
         angle = _number(source, "target", "angle", "emission", default=12.0)
         spectrum = tube_spectrum(
             voltage, anode=str(_get(source, "target", "material_id") or "W"), anode_angle_deg=float(angle or 12.0)
@@ -206,6 +223,23 @@ def _spectrum(content: Mapping[str, Any], materials: Mapping[str, Material]) -> 
         # The format's ideal detector counts all energy that arrives.
         return Spectrum(energy=spectrum.energy, weight=spectrum.weight * spectrum.energy)
     return spectrum.absorbed_energy(str(scintillator), thickness, materials)
+
+
+def _spectrum_file(path: Path) -> Spectrum:
+    """Energy (keV) and photons, two columns with comment lines, as CTSimU's spectrum files have them."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise FileError(f"CTSimU: the spectrum file {path} cannot be read: {error}", path=path) from error
+    rows = [re.split(r"[\s,;]+", line.strip())[:2] for line in lines if line.strip() and line.lstrip()[0] not in "#%"]
+    try:
+        table = np.array([[float(word) for word in row] for row in rows if not row[0][:1].isalpha()])
+    except ValueError as error:
+        raise InputError(f"CTSimU: {path} is not a spectrum of energy (keV) and photons: {error}") from error
+    if table.ndim != 2 or table.shape[1] != 2:
+        raise InputError(f"CTSimU: {path} holds no two columns, energy (keV) and photons")
+    table = table[table[:, 0] > 0]
+    return Spectrum(energy=table[:, 0], weight=table[:, 1])
 
 
 def _spot(content: Mapping[str, Any]) -> FocalSpot:

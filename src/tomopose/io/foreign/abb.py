@@ -1,0 +1,160 @@
+"""ABB: RAPID modules (.mod, .prg, .sys) and lists of robtargets or jointtargets.  mm, quaternions (w, x, y, z), deg.
+
+The pose is the tool's in the active work object.  Source: ABB Technical reference manual, RAPID data types
+(robtarget: trans, rot, robconf, extax; jointtarget: robax, extax).
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from tomopose.errors import InputError
+from tomopose.io.foreign.foreign_file import ForeignFile
+from tomopose.io.foreign.kind import Kind
+from tomopose.io.foreign.number_words import NUM, number_word
+from tomopose.io.foreign.pose_log import PoseLog, PoseOptions, Row, numbered, one_value, some, visiting_order
+from tomopose.io.foreign.program_remarks import Remarks
+
+_N = rf"\s*({NUM})\s*"
+TARGET = re.compile(rf"\[\s*\[{_N},{_N},{_N}\]\s*,\s*\[{_N},{_N},{_N},{_N}\](?P<rest>[^;]*)")
+JOINTS = re.compile(rf"\[\s*\[{_N},{_N},{_N},{_N},{_N},{_N}\]\s*,\s*\[")
+NAMED = re.compile(r"\b(?:robtarget|jointtarget)\s+(\w+)\s*:=", re.IGNORECASE)
+MOVE = re.compile(r"\bMove(?P<kind>L|J|C|AbsJ)\w*\s*(?P<to>[^;]*);", re.IGNORECASE)
+COMPUTED = re.compile(r"\b(Offs|RelTool)\s*\(", re.IGNORECASE)
+EXTERNAL = re.compile(rf"\[((?:\s*{NUM}\s*,){{5}}\s*{NUM}\s*)\]\s*\]")
+UNUSED_AXIS = 9e8
+"""RAPID writes 9E9 for an external axis that is not there."""
+
+
+@dataclass(frozen=True)
+class _Target:
+    name: str
+    words: Row
+    line: int
+    external: str
+
+
+def recognise(file: ForeignFile) -> bool:
+    """RAPID text, or lines that hold robtargets."""
+    if not file.is_text:
+        return False
+    if re.search(r"\b(robtarget|jointtarget)\b", file.text, re.IGNORECASE):
+        return True
+    return bool(TARGET.search(file.text) and (file.suffix in (".mod", ".prg", ".sys", ".txt", ".log", ".csv")))
+
+
+def read(file: ForeignFile, options: PoseOptions) -> PoseLog:
+    """The robtargets of a module, in the order of its moves; jointtargets where it has nothing else."""
+    targets, remarks = _targets(file, TARGET)
+    if not targets:
+        return _joints(file)
+    moves = list(_moves(file))
+    if computed := next((line for line, _, to in moves if COMPUTED.search(to)), None):
+        raise InputError(
+            f"{file.path}: line {computed}: the target is computed (Offs, RelTool), which the file does not state; "
+            "log the robot's positions (CRobT), or write the targets out"
+        )
+    named = {t.name: t for t in targets if t.name}
+    inline = [t for t in targets if not t.name]
+    notes: tuple[str, ...] = ()
+    chosen = inline
+    if named and not inline:
+        visited = [w for _, kind, to in moves for w in [_name(kind, to)] if w]
+        names, notes = visiting_order(list(named), visited)
+        chosen = [named[n] for n in names]
+    elif named:
+        notes = (f"declared targets are left out beside those written in the moves: {some(list(named))}",)
+    said = remarks.columns() if len(remarks.ids) == len(chosen) else {}
+    if "pose_id" not in said and not inline:
+        said["pose_id"] = numbered([t.name for t in chosen])
+    log = PoseLog(
+        path=file.path,
+        convention="abb",
+        rows=tuple(t.words for t in chosen),
+        source="set" if moves or named else "encoder",
+        lines=tuple(t.line for t in chosen),
+        notes=notes,
+        **said,
+    )
+    return log.with_notes(_frames(file, moves), _external(chosen))
+
+
+def _code(line: str) -> str:
+    """A line without its remark."""
+    return line.split("!", 1)[0]
+
+
+def _targets(file: ForeignFile, pattern: re.Pattern[str]) -> tuple[list[_Target], Remarks]:
+    found, remarks = [], Remarks()
+    for number, line in enumerate(file.lines, start=1):
+        remarks.line(line)
+        code = _code(line)
+        name = NAMED.search(code)
+        for match in pattern.finditer(code):
+            words = tuple(number_word(w, f"{file.path}: line {number}") for w in match.groups()[:7] if w is not None)
+            rest = EXTERNAL.search(match.group(0))
+            found.append(_Target(name[1] if name else "", words, number, rest[1] if rest else ""))
+            remarks.pose()
+    return found, remarks
+
+
+def _moves(file: ForeignFile) -> list[tuple[int, str, str]]:
+    return [
+        (number, m["kind"].lower(), m["to"])
+        for number, line in enumerate(file.lines, start=1)
+        for m in MOVE.finditer(_code(line))
+    ]
+
+
+def _name(kind: str, to: str) -> str:
+    """The name of the target of a move; of a circle its end."""
+    words = [w.strip() for w in to.lstrip("\\").split(",")]
+    word = words[1] if kind == "c" and len(words) > 1 else words[0]
+    return word if re.fullmatch(r"[A-Za-z]\w*", word) else ""
+
+
+def _joints(file: ForeignFile) -> PoseLog:
+    targets, _ = _targets(file, JOINTS)
+    if not targets:
+        raise InputError(f"{file.path}: no robtarget and no jointtarget holds numbers")
+    moves = [_name(kind, to) for _, kind, to in _moves(file)]
+    named = {t.name or f"line {t.line}": t for t in targets}
+    names, notes = visiting_order(list(named), moves)
+    return PoseLog(
+        path=file.path,
+        convention="abb",
+        joints=tuple(named[n].words for n in names),
+        source="set",
+        pose_id=numbered(names),
+        lines=tuple(named[n].line for n in names),
+        notes=(*notes, "joint angles alone: the robot's file (--manipulator robot.json) turns them into poses"),
+    )
+
+
+def _frames(file: ForeignFile, moves: list[tuple[int, str, str]]) -> str:
+    """Tool and work object of the moves; InputError where they change between poses."""
+    linear = [to for _, kind, to in moves if kind != "absj"]
+    tools = [re.split(r"\\", to.rsplit(",", 1)[-1])[0].strip() for to in linear]
+    objects = [m[1] if (m := re.search(r"\\WObj\s*:=\s*(\w+)", to, re.IGNORECASE)) else "wobj0" for to in linear]
+    if not linear:
+        return ""
+    tool, wobj = one_value(tools, "the tool", file.path), one_value(objects, "the work object", file.path)
+    return f"all poses are of tool {tool} in work object {wobj}; both must stay as they are for the scan"
+
+
+def _external(targets: list[_Target]) -> str:
+    """External axes that are in use: a table may be among them."""
+    used = [[w for w in t.external.split(",") if w.strip() and abs(float(w)) < UNUSED_AXIS] for t in targets]
+    if not any(used):
+        return ""
+    return f"external axes are in use (first pose: {', '.join(w.strip() for w in used[0])}) and are not read as alpha"
+
+
+KIND = Kind(
+    name="abb",
+    maker="ABB",
+    what="a RAPID module or a list of robtargets",
+    recognise=recognise,
+    read_poses=read,
+)
