@@ -25,7 +25,7 @@ from tomopose.io.volume_files import read_volume, write_volume
 from tomopose.manipulator.files import read_manipulator, write_manipulator
 from tomopose.manipulator.twin_file import read_twin
 from tomopose.measurement.mesh.cmm_correction import read_probed_points
-from tomopose.measurement.mesh.mesh import read_mesh
+from tomopose.measurement.mesh.mesh_files import read_mesh
 from tomopose.measurement.plan import read_plan
 from tomopose.simulation.objects.mesh import read_mesh as read_simulated_mesh
 from tomopose.simulation.scene.scene import read_scene

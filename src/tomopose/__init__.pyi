@@ -85,7 +85,7 @@ from .measurement.budget import Budget as Budget
 from .measurement.features.feature import Feature as Feature
 from .measurement.measure import measure as measure
 from .measurement.mesh.mesh import Mesh as Mesh
-from .measurement.mesh.mesh import read_mesh as read_mesh
+from .measurement.mesh.mesh_files import read_mesh as read_mesh
 from .measurement.plan import AlignmentPlan as AlignmentPlan
 from .measurement.plan import FeaturePlan as FeaturePlan
 from .measurement.plan import LimitPlan as LimitPlan

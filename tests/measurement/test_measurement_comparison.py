@@ -16,7 +16,8 @@ from tomopose.measurement.alignment import Alignment, from_points
 from tomopose.measurement.mesh.cmm_correction import corrected_reference, read_probed_points
 from tomopose.measurement.mesh.comparison import compare
 from tomopose.measurement.mesh.comparison_files import FILES, write_comparison
-from tomopose.measurement.mesh.mesh import Mesh, read_mesh, signed_distances
+from tomopose.measurement.mesh.mesh import Mesh, signed_distances
+from tomopose.measurement.mesh.mesh_files import read_mesh
 from tomopose.measurement.mesh.refine import refined
 from tomopose.volume import VoxelGrid
 
@@ -264,5 +265,5 @@ class TestBadReference:
             (tmp_path / name).write_bytes(content)
             with pytest.raises(FileError):
                 read_mesh(tmp_path / name)
-        with pytest.raises(FileError, match="cannot be read"):
+        with pytest.raises(FileError, match="does not exist"):
             read_mesh(tmp_path / "none.stl")

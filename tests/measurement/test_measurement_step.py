@@ -9,7 +9,7 @@ import pytest
 from step_box import step_box
 
 from tomopose.errors import EngineMissingError, FileError
-from tomopose.measurement.mesh.mesh import read_mesh
+from tomopose.measurement.mesh.mesh_files import read_mesh
 
 SIDES = np.array([10.0, 20.0, 30.0])
 

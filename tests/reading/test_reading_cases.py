@@ -16,7 +16,7 @@ from tomopose.exports.reading import read_geometry
 from tomopose.io.volume_files import read_volume
 from tomopose.manipulator.files import read_manipulator
 from tomopose.manipulator.twin_file import read_twin
-from tomopose.measurement.mesh.mesh import read_mesh
+from tomopose.measurement.mesh.mesh_files import read_mesh
 
 
 @pytest.fixture(scope="module")

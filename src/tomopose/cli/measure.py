@@ -168,12 +168,15 @@ def measure(options: Options) -> int:
         results = replace(results, calibration_u=calibration_u(results, plan, calibrations, scans))
     if o.scene is not None:
         results = replace(results, simulated=simulated(o, o.scene, plan, next(iter(volumes.values())), calibrations))
-    comparisons = {}
+    comparisons: dict[str, Comparison] = {}
     with atomic_folder(o.out, force=o.force, stale=WRITTEN) as folder:
-        for name, one in volumes.items() if mesh is not None else ():
-            comparisons[name] = compared(one, mesh, results.alignments[name], fit=o.fit, search_mm=o.search_mm)
-            place = folder / name if len(volumes) > 1 else folder
-            write_comparison_to(place, comparisons[name], o.range_um / 1000, name)
+        if mesh is not None:
+            comparisons = {
+                n: compared(v, mesh, results.alignments[n], fit=o.fit, search_mm=o.search_mm)
+                for n, v in volumes.items()
+            }
+        for name, one in comparisons.items():
+            write_comparison_to(folder / name if len(volumes) > 1 else folder, one, o.range_um / 1000, name)
         protocols = protocols_of(o, results, plan, folder)
         write_results(folder, results, force=True)
         page = measurement_report(results, comparisons=comparisons, range_mm=o.range_um / 1000)
@@ -213,7 +216,7 @@ def _in_words(decisions: Mapping[str, str]) -> str:
 def reference_of(path: Path, edge_mm: float | None, probed: Path | None, between: str) -> Mesh:
     """The reference mesh, of smaller triangles and corrected by probed points where that is asked for."""
     from tomopose.measurement.mesh.cmm_correction import corrected_reference, read_probed_points
-    from tomopose.measurement.mesh.mesh import read_mesh
+    from tomopose.measurement.mesh.mesh_files import read_mesh
     from tomopose.measurement.mesh.refine import refined
 
     mesh = read_mesh(path)

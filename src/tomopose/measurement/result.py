@@ -14,12 +14,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
+from typing import Any, Literal
 
 from tomopose.coverage import combined, expanded
 
+FormKind = Literal["form", "form_95", "form_25"]
 FIT_ALONE = "fit alone, without the systematic part"
-FORMS = ("form", "form_95", "form_25")
+FORMS: tuple[FormKind, ...] = ("form", "form_95", "form_25")
 
 
 class Decision(Enum):

@@ -32,7 +32,7 @@ from tomopose.manipulator.error_models import RigidErrors, correction
 from tomopose.manipulator.real_poses import moved
 from tomopose.measurement.measure import measure
 from tomopose.measurement.plan import MeasurementPlan
-from tomopose.measurement.results import MeasurementResult
+from tomopose.measurement.result import MeasurementResult
 from tomopose.measurement.uncertainty import Simulated, shortest_interval
 from tomopose.reconstruction.run import reconstruct
 from tomopose.simulation.detector.detector import expose, reference_images

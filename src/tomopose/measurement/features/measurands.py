@@ -210,5 +210,7 @@ def _propagated(
             g[i] = (above - function(*moved)) / (2 * h)
         used = g != 0
         shares.append(float(g[used] @ f.covariance[np.ix_(used, used)] @ g[used]))
-    u, dof = combined((math.sqrt(max(share, 0.0)), max(f.dof, 1.0)) for share, f in zip(shares, features, strict=True))
-    return Measured(value=value, u=u, dof=dof, unit=unit, direction=direction, method=method)
+    u_all, dof = combined(
+        (math.sqrt(max(share, 0.0)), max(f.dof, 1.0)) for share, f in zip(shares, features, strict=True)
+    )
+    return Measured(value=value, u=u_all, dof=dof, unit=unit, direction=direction, method=method)
