@@ -27,6 +27,7 @@ from tomopose.manipulator.twin_file import read_twin
 from tomopose.measurement.mesh.cmm_correction import read_probed_points
 from tomopose.measurement.mesh.mesh_files import read_mesh
 from tomopose.measurement.plan import read_plan
+from tomopose.reading import parse_json, read_text
 from tomopose.simulation.objects.mesh import read_mesh as read_simulated_mesh
 from tomopose.simulation.scene.scene import read_scene
 
@@ -64,7 +65,7 @@ def sized(path: Path) -> None:
 
 
 def scenario(path: Path) -> None:
-    tp.run_from_ctsimu(json.loads(path.read_text(encoding="utf-8", errors="replace")))
+    tp.run_from_ctsimu(parse_json(read_text(path), path))
 
 
 def volume(path: Path) -> None:
@@ -128,7 +129,7 @@ def _tables(folder: Path, scanner: tp.Scanner) -> Iterator[Seed]:
     calibration = tp.calibrate(wide, poses, observations)
     tp.write_calibration(folder / "calibration.json", calibration)
     yield Seed(kind="calibration", path=folder / "calibration.json", read=tp.read_calibration)
-    for _ in range(3):
+    for _ in range(1):
         tp.append_history(folder / "history.jsonl", calibration)
     yield Seed(kind="history", path=folder / "history.jsonl", read=read_history)
 

@@ -6,9 +6,11 @@ neither a full disk nor Ctrl-C leaves half a file.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import re
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -22,12 +24,16 @@ from tomopose.reading.text import parse_json, read_text
 
 __all__ = [
     "SCHEMA",
+    "EditedWarning",
     "atomic_file",
     "atomic_folder",
     "plain",
     "read_json",
     "require_absent",
     "sync_folder",
+    "warn_edited",
+    "warn_if_edited",
+    "was_edited",
     "write_json",
     "write_text",
 ]
@@ -67,7 +73,48 @@ def write_text(path: str | Path, text: str) -> None:
 def write_json(path: str | Path, name: str, content: Mapping[str, Any], *, version: int = 1) -> None:
     """JSON of schema `tomopose/NAME/VERSION`, atomically, floats with all their digits."""
     document = {"schema": f"tomopose/{name}/{version}", **plain(content)}
+    if name in SEALED:
+        document[DIGEST] = _digest(document)
     write_text(path, json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+SEALED = frozenset(
+    {"calibration", "truth", "measurement", "exports", "study", "refined", "scan-plan", "comparison", "resolution"}
+)
+"""Results: files that nobody writes by hand.  Each holds the SHA-256 of its own content."""
+DIGEST = "content_sha256"
+
+
+class EditedWarning(UserWarning):
+    """A result was changed after it was written."""
+
+
+def _digest(document: Mapping[str, Any]) -> str:
+    """SHA-256 over a JSON object's content but the digest's own entry, whatever its layout and order."""
+    content = {key: value for key, value in document.items() if key != DIGEST}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def was_edited(document: Mapping[str, Any]) -> bool:
+    """Whether a result's content is another than it was written with; False where it holds no digest (schema 1)."""
+    return DIGEST in document and document[DIGEST] != _digest(document)
+
+
+def warn_if_edited(document: Mapping[str, Any], path: str | Path) -> None:
+    """EditedWarning, by name, where a result was changed after it was written."""
+    if was_edited(document):
+        warn_edited(path)
+
+
+def warn_edited(path: str | Path) -> None:
+    """EditedWarning for this file."""
+    warnings.warn(
+        f"{path} was edited after it was written: its content has another SHA-256 than it says. Its numbers may "
+        "not belong together; make it again from its inputs",
+        EditedWarning,
+        stacklevel=3,
+    )
 
 
 def read_json(path: str | Path, name: str, *, version: int = 1) -> dict[str, Any]:

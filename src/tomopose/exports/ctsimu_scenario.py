@@ -24,6 +24,8 @@ from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.geometry.rotations import R_z, exp_rotation
 from tomopose.units import Array, float_array
 
+MOST_VIEWS = 100_000
+"""A scan of a month, at one view in half a minute; each view is an entry of several arrays."""
 NEWEST = (1, 2)
 UNITS: Mapping[str, Mapping[str, float]] = {
     "mm": {"nm": 1e-6, "um": 1e-3, "mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0},
@@ -48,6 +50,8 @@ def from_ctsimu(content: Mapping[str, Any], given: Given, *, where: str = "the C
     n = n.get("value") if isinstance(n, Mapping) else n
     if isinstance(n, bool) or not isinstance(n, int) or n < 1:
         raise InputError(f"{where}: acquisition.number_of_projections is {n!r}; a positive whole number is needed")
+    if n > MOST_VIEWS:
+        raise InputError(f"{where}: acquisition.number_of_projections is {n}; at most {MOST_VIEWS} are read")
     binning = {} if acquisition.get("pixel_binning") is None else _section(acquisition, "pixel_binning", where)
     for axis, factor in binning.items():
         if (factor.get("value") if isinstance(factor, Mapping) else factor) not in (None, 1):

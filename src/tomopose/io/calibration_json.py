@@ -14,7 +14,7 @@ import numpy as np
 from tomopose.calibration.result import Assumed, Calibration, Observability, Parameter
 from tomopose.coverage import expanded_k2
 from tomopose.errors import FileError, InputError
-from tomopose.files import read_json, require_absent, write_json
+from tomopose.files import read_json, require_absent, warn_if_edited, write_json
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import rotation_angle_between, rotation_from_angles
 from tomopose.geometry.scanner import PARAMETER_UNITS
@@ -25,6 +25,8 @@ from tomopose.io.calibration.version_1 import as_version_2
 from tomopose.io.numbers_json import decode_array, encode
 from tomopose.io.scanner_json import scanner_document, scanner_from_document
 from tomopose.provenance import Provenance
+from tomopose.reading import reader
+from tomopose.reading.contradictions import require_consistent_calibration
 
 VERSION = 2
 ANGLES_TOLERANCE = 1e-9
@@ -120,20 +122,25 @@ def tangent_units(cal: Calibration) -> list[str]:
     return [unit(name) for name in cal.tangent]
 
 
+@reader("calibration.json")
 def read_calibration(path: str | Path) -> Calibration:
     """Read calibration.json.
 
     Raises FileError or SchemaVersionError where it is no such file, InputError where a part is missing or does not fit.
     """
     document = read_json(path, "calibration", version=VERSION)
+    version = int(str(document["schema"]).rpartition("/")[2])
+    require_consistent_calibration(document, str(path), version=version)
     try:
-        return _calibration(as_version_2(document), str(path))
+        found = _calibration(as_version_2(document), str(path))
     except KeyError as error:
         raise InputError(f"{path}: the key {error} is missing") from error
     except InputError as error:
         raise error if str(error).startswith(str(path)) else InputError(f"{path}: {error}") from error
     except (TypeError, ValueError, AttributeError, OverflowError) as error:
         raise FileError(f"{path} is damaged: {error}", path=path) from error
+    warn_if_edited(document, path)
+    return found
 
 
 def _calibration(document: Mapping[str, Any], where: str) -> Calibration:

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tomopose.errors import FileError, InputError, SchemaVersionError
-from tomopose.files import SCHEMA, atomic_file, require_absent
+from tomopose.files import SCHEMA, atomic_file, require_absent, warn_edited
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.io.scanner_json import scanner_document, scanner_from_document
 from tomopose.io.table_text import unknown_column
 from tomopose.provenance import Provenance
 from tomopose.reading import parse_json, reader
 from tomopose.reading.arrays import read_npz
+from tomopose.reading.contradictions import require_one_handedness, require_same, require_unique, require_whole
 
 REQUIRED = ("P", "n_u", "n_v", "p_u", "p_v", "pose_id")
 SIGMA = {"P_points_sigma_px": "points_sigma", "P_points_sigma_shared_px": "points_sigma_shared"}
-KNOWN = ("schema", *REQUIRED, *SIGMA, "in_front_mm", "scanner", "provenance")
+DIGEST = "content_sha256"
+KNOWN = ("schema", *REQUIRED, *SIGMA, "in_front_mm", "scanner", "provenance", DIGEST)
 
 
 def write_matrices(
@@ -43,6 +47,7 @@ def write_matrices(
         content["scanner"] = json.dumps({"schema": "tomopose/scanner/1", **scanner_document(P.scanner)})
     if provenance is not None:
         content["provenance"] = json.dumps(provenance.to_json())
+    content[DIGEST] = _digest({key: np.asarray(value) for key, value in content.items()})
     with atomic_file(path) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, **content)
 
@@ -67,11 +72,12 @@ def read_matrices(path: str | Path) -> ProjectionMatrices:
     missing = [key for key in REQUIRED if key not in content]
     if missing:
         raise InputError(f"{path}: {', '.join(missing)} missing")
+    _require_consistent(content, str(path))
     try:
         scanner = None
         if "scanner" in content:
             scanner = scanner_from_document(parse_json(str(content["scanner"]), f"{path}: scanner"), "scanner")
-        return ProjectionMatrices(
+        found = ProjectionMatrices(
             P=content["P"],
             n_u=int(content["n_u"]),
             n_v=int(content["n_v"]),
@@ -82,10 +88,15 @@ def read_matrices(path: str | Path) -> ProjectionMatrices:
             in_front=content.get("in_front_mm", np.zeros(3)),
             **{name: content.get(key) for key, name in SIGMA.items()},
         )
+        _require_scanner_of(found, str(path))
     except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        raise error if str(error).startswith(str(path)) else InputError(f"{path}: {error}") from error
     except (TypeError, ValueError, AttributeError) as error:
         raise FileError(f"{path} is damaged: {error}", path=path) from error
+    digest = content.get(DIGEST)
+    if digest is not None and str(digest) != _digest(content):
+        warn_edited(path)
+    return found
 
 
 @reader("matrices.npz")
@@ -95,6 +106,40 @@ def read_matrices_provenance(path: str | Path) -> Provenance | None:
     if "provenance" not in content:
         return None
     return Provenance.from_json(parse_json(str(content["provenance"]), f"{path}: provenance"))
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    """SHA-256 over the names, types, shapes and bytes of all arrays but the digest's own."""
+    whole = hashlib.sha256()
+    for key in sorted(set(content) - {DIGEST}):
+        array = np.ascontiguousarray(content[key])
+        whole.update(f"{key} {array.dtype.str} {np.shape(content[key])}\n".encode() + array.tobytes())
+    return whole.hexdigest()
+
+
+def _require_consistent(content: Mapping[str, Any], where: str) -> None:
+    """InputError where the arrays contradict each other: sizes, names, uncertainties, mirrored single views."""
+    for key in ("n_u", "n_v"):
+        require_whole(content[key], key, where)
+    if content["pose_id"].ndim != 1:
+        raise InputError(f"{where}: pose_id has shape {content['pose_id'].shape}; one name for each view is needed")
+    names = [str(name) for name in content["pose_id"].tolist()]
+    require_unique(names, "the pose id", where)
+    P = content["P"]
+    if P.ndim == 3 and P.shape[1:] == (3, 4) and P.dtype.kind == "f" and np.isfinite(P).all() and len(P) == len(names):
+        require_one_handedness(P, names, where)
+    for key in SIGMA:
+        if key in content and not (np.isfinite(content[key]).all() and (content[key] >= 0).all()):
+            raise InputError(f"{where}: {key} holds values that are negative or not finite")
+
+
+def _require_scanner_of(matrices: ProjectionMatrices, where: str) -> None:
+    """InputError where the scanner in the file has another panel than the matrices beside it."""
+    scanner = matrices.scanner
+    if scanner is None:
+        return
+    for name in ("n_u", "n_v", "p_u", "p_v"):
+        require_same(float(getattr(scanner, name)), float(getattr(matrices, name)), f"{name} of the scanner", where)
 
 
 def _load(path: Path) -> dict[str, Any]:

@@ -23,6 +23,8 @@ NUMBERS = {"snr": "snr", "semi_major": "semi_major_px", "semi_minor": "semi_mino
 ELLIPSE = ("u_ellipse_px", "v_ellipse_px")
 COVARIANCE = "cov_uv_px2"
 KNOWN = (*REQUIRED, "image", "seen", "status", *NUMBERS.values(), *ELLIPSE, COVARIANCE)
+SMALLEST_SIGMA_PX, LARGEST_SIGMA_PX = 1e-9, 1e4
+"""The best radiographs give 1e-4 px, and 1e-9 px is rounding; 1e4 px is wider than a panel."""
 YES, NO = ("1", "true", "yes"), ("0", "false", "no")
 LONG = Context(prec=40)
 
@@ -93,6 +95,11 @@ def _variance(table: TextTable, column: str, unseen: Sequence[bool]) -> Array:
     sigma = table.numbers(column, blank=unseen)
     for i in np.flatnonzero(sigma <= 0):
         raise InputError(f"{table.where(int(i), column)}: sigma is {sigma[i]:g} px; it must be above 0")
+    for i in np.flatnonzero((sigma < SMALLEST_SIGMA_PX) | (sigma > LARGEST_SIGMA_PX)):
+        raise InputError(
+            f"{table.where(int(i), column)}: sigma is {sigma[i]:g} px; a centre is measured to between "
+            f"{SMALLEST_SIGMA_PX:g} and {LARGEST_SIGMA_PX:g} px"
+        )
     k = table.columns.index(column)
     return np.array(
         [

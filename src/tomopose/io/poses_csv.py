@@ -237,6 +237,7 @@ def _pose(table: TextTable, convention: Convention, *, commanded: bool, confirme
             unit_checks.require_radians(orientations, f"{table.path}: {', '.join(columns[3:])}")
         where = f"{table.path}: {', '.join(columns[:3])}"
         unit_checks.require_millimetres(positions, where, convention=convention.name)
+        unit_checks.require_one_unit(positions, orientations if convention.unit == "deg" else None, where)
     try:
         R = rotation_from_convention(orientations, convention.name)
     except InputError as error:

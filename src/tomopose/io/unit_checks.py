@@ -104,6 +104,55 @@ def require_millimetres(positions: Array, where: str, *, convention: str = "") -
         )
 
 
+MIXED_AT_MOST_MM, MIXED_TOLERANCE = 0.05, 0.005
+"""Rows in metres stay below 0.05 (50 mm); relative agreement with what other rows hold in mm."""
+
+
+def require_one_unit(positions: Array, angles: Array | None, where: str) -> None:
+    """UnitError where single rows are in metres or radians, and the others in mm or degrees.
+
+    Such a row is small throughout, and each of its values, converted, is one that other rows have in the same column:
+    plans repeat their levels.  Rows near zero, as encoders read them there, are no such rows.
+    """
+    row = _row_in_other_unit(positions, 1000.0, MIXED_AT_MOST_MM, ENCODER_NOISE_MM)
+    if row is not None:
+        x = positions[row]
+        raise UnitError(
+            f"{where}: row {row + 1} ({_shown(x)}) looks like metres among rows in mm: other rows hold "
+            f"{_shown(1000 * x)}; convert it, or {TABLE_REMEDY}"
+        )
+    row = None if angles is None else _row_in_other_unit(angles, math.degrees(1.0), ONE_TURN / 2, 0.004)
+    if row is not None and angles is not None:
+        a = angles[row]
+        raise UnitError(
+            f"{where}: row {row + 1} ({_shown(a)}) looks like radians among rows in degrees: other rows hold "
+            f"{_shown(np.degrees(a))}; convert it, or {TABLE_REMEDY}"
+        )
+
+
+def _row_in_other_unit(values: Array, factor: float, at_most: float, noise: float) -> int | None:
+    """The first row all of whose values, times the factor, are levels of other rows but are none as they stand."""
+    size = np.abs(values).max(axis=1, initial=0.0)
+    small = (size < at_most) & (size > noise)
+    levels = [values[~small & (np.abs(column) > at_most), k] for k, column in enumerate(values.T)]
+    for row in np.flatnonzero(small):
+        counted = [k for k in range(values.shape[1]) if abs(values[row, k]) > max(noise, 0.05 * size[row])]
+        if all(_near(values[row, k] * factor, levels[k]) for k in counted) and not any(
+            _near(values[row, k], values[~small, k]) for k in counted
+        ):
+            return int(row)
+    return None
+
+
+def _near(value: float, levels: Array) -> bool:
+    """Whether at least two of the levels, as a plan has them, are this value."""
+    return bool((np.abs(np.abs(levels) - abs(value)) <= MIXED_TOLERANCE * abs(value)).sum() >= 2)
+
+
+def _shown(values: Array) -> str:
+    return ", ".join(f"{v:.5g}" for v in values)
+
+
 def _largest(values: Array) -> float:
     return float(np.abs(values).max(initial=0.0))
 

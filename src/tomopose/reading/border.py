@@ -82,9 +82,7 @@ def reading(path: Path | str, what: str) -> Iterator[None]:
     """Turns what other libraries raise inside into FileError; `what` names the kind of file."""
     try:
         yield
-    except TomoposeError:
-        raise
-    except OUR_FAULTS:
+    except (TomoposeError, Warning, *OUR_FAULTS):  # a warning is raised where the caller forbids it
         raise
     except FileNotFoundError as error:
         raise FileError(f"{error.filename or path} does not exist", path=path) from error
