@@ -6,10 +6,10 @@ from .calibration.arrangements.multi_sphere import BallPose as BallPose
 from .calibration.arrangements.multi_sphere import pose_from_balls as pose_from_balls
 from .calibration.arrangements.twin_robots import calibrate_twin as calibrate_twin
 from .calibration.arrangements.twin_robots import twin_matrices as twin_matrices
+from .calibration.checks.alternative import Alternative as Alternative
 from .calibration.checks.convention_tests import Diagnosis as Diagnosis
 from .calibration.checks.convention_tests import Hypothesis as Hypothesis
 from .calibration.checks.convention_tests import diagnose as diagnose
-from .calibration.checks.conventions import Rival as Rival
 from .calibration.model.problem import Problem as Problem
 from .calibration.projection_matrices import projection_matrices as projection_matrices
 from .calibration.records.charts import ControlChart as ControlChart

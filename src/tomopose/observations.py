@@ -28,6 +28,7 @@ class BallObservations(Rows):
     image:      n file names, or None.
     snr, semi_major, semi_minor, angle: (n,) background SNR, silhouette ellipse (px, px, rad), NaN where unknown.
     x_ellipse:  (n, 2) px, centre of the silhouette's ellipse: *not* the projected centre (paper ref. [19]).
+    ball_diameter: mm, of every ball here, or None; with the semi axes it is a gauge of the calibrated magnification.
     """
 
     x_D: Array
@@ -41,6 +42,7 @@ class BallObservations(Rows):
     semi_minor: Array | None = None
     angle: Array | None = None
     x_ellipse: Array | None = None
+    ball_diameter: float | None = None
 
     def __post_init__(self) -> None:
         x_D, covariance = float_array(self.x_D), float_array(self.covariance)
@@ -82,6 +84,8 @@ class BallObservations(Rows):
             if len(self.image) != n:
                 raise ShapeError(f"{n} observations but {len(self.image)} image names")
             object.__setattr__(self, "image", tuple(self.image))
+        if self.ball_diameter is not None and not (np.isfinite(self.ball_diameter) and self.ball_diameter > 0):
+            raise InputError(f"ball_diameter is {self.ball_diameter}; a diameter above 0 in mm is needed")
         for name in (*OPTIONAL_COLUMNS, "x_ellipse"):
             column = getattr(self, name)
             if column is not None:
@@ -137,6 +141,17 @@ class BallObservations(Rows):
             image=None if self.image is None else tuple(self.image[k] for k in i),
             **{name: of(getattr(self, name)) for name in (*OPTIONAL_COLUMNS, "x_ellipse")},
         )
+
+    def with_ball_diameter(self, ball_diameter: float | None) -> BallObservations:
+        """The same observations of balls of that diameter, mm; None leaves what is known."""
+        return self if ball_diameter is None else replace(self, ball_diameter=float(ball_diameter))
+
+    @property
+    def outline(self) -> Array | None:
+        """(n,) px^2: product of the semi axes of the silhouette, NaN where unknown; None where none is known."""
+        if self.semi_major is None or self.semi_minor is None:
+            return None
+        return np.asarray(self.semi_major * self.semi_minor, dtype=np.float64)
 
     @property
     def used(self) -> BallObservations:

@@ -9,7 +9,7 @@ import pytest
 from calibration_cases import BALL, MOUNT, SCANNER, mixed_poses, observe, paper_poses
 
 from tomopose.calibration.checks.convention_tests import diagnose
-from tomopose.calibration.checks.conventions import RIVALS
+from tomopose.calibration.checks.conventions import ALTERNATIVES
 from tomopose.calibration.model.problem import pair
 from tomopose.calibration.solve import calibrate
 from tomopose.geometry.frames import Frame
@@ -80,7 +80,7 @@ def test_the_true_rival_comes_first(name):
     assert name == best.name or next(h for h in found.hypotheses if h.name == name).delta < 0.9 * best.delta
     assert best.d_rms < 0.1
     assert name in " ".join(h.name for h in found.better)
-    assert all(h.cure for h in found.better)
+    assert all(h.remedy for h in found.better)
 
 
 def test_quick_rivals_reject_a_calibration():
@@ -89,7 +89,7 @@ def test_quick_rivals_reject_a_calibration():
     assert cal.verdict == "rejected"
     assert "counted the other way" in cal.reasons[0]
     assert cal.hypotheses[0].outcome == "better"
-    assert cal.hypotheses[0].cure
+    assert cal.hypotheses[0].remedy
 
 
 def test_mixed_poses_tell_all_but_the_true_symmetries():
@@ -132,17 +132,17 @@ def test_set_and_encoder_poses_are_rivals():
 def test_rivals_change_nothing_and_have_different_names():
     problem = pair(SCANNER, MIXED, observe(MIXED))
     before = [a.copy() for a in (problem.R_MH, problem.t_MH, problem.x_D, problem.alpha)]
-    for rival in RIVALS:
-        rival.change(problem)
+    for alternative in ALTERNATIVES:
+        alternative.change(problem)
     for a, b in zip(before, (problem.R_MH, problem.t_MH, problem.x_D, problem.alpha), strict=True):
         np.testing.assert_array_equal(a, b)
-    assert len({r.name for r in RIVALS}) == len(RIVALS) >= 40
+    assert len({r.name for r in ALTERNATIVES}) == len(ALTERNATIVES) >= 40
 
 
 def test_a_turned_scanner_keeps_the_truth():
     """The true symmetry, by its own definition: half a turn about the beam, table counted backwards."""
-    rival = next(r for r in RIVALS if r.symmetry and "180" in r.name)
-    problem = rival.change(pair(SCANNER, MIXED, observe(MIXED, seed=None)))
+    alternative = next(r for r in ALTERNATIVES if r.symmetry and "180" in r.name)
+    problem = alternative.change(pair(SCANNER, MIXED, observe(MIXED, seed=None)))
     turned = PoseSequence(T_MH=MIXED.T_MH, pose_id=MIXED.pose_id, alpha=problem.alpha)
     cal = calibrate(
         SCANNER, turned, BallObservations.from_sigma(problem.x_D, 0.01, pose_id=MIXED.pose_id), hypotheses=False

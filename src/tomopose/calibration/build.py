@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from tomopose.calibration.checks.ball_size import chain_matrices, measured_ball_size, require_ball_size
 from tomopose.calibration.checks.convention_tests import Diagnosis
-from tomopose.calibration.checks.rules import AgainstRigid, Evidence, ScatterFound, findings
+from tomopose.calibration.checks.rules import AgainstRigid, BallSize, Evidence, ScatterFound, findings
 from tomopose.calibration.checks.stability import stability
-from tomopose.calibration.checks.verdict import Finding
 from tomopose.calibration.model.covariance import angles_by_tangent
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, base_name, unit_of
@@ -58,6 +58,7 @@ class Fitted:
     misfit:       more rows fail than may be outliers.
     expected_px, stated_px: d_rms that the covariances in use and the stated ones explain.
     magnification_at_ball: mean of d_SD over the ball's distance.
+    view_matrices: (n, 3, 4) from the balls' frame to pixels of the rows used, where source and panel move apart.
     """
 
     everything: Problem
@@ -92,6 +93,7 @@ class Fitted:
     pose_noise: PoseNoiseFound | None = None
     views: ViewDistances | None = None
     magnification_at_ball: float | None = None
+    view_matrices: Array | None = None
     provenance: Provenance | None = None
 
 
@@ -134,7 +136,12 @@ def build(f: Fitted) -> Calibration:
         provenance=f.provenance,
     )
     result = replace(result, stability=stability(f.linear, f.T_HT.R, f.everything, f.keep))
-    return replace(result, checks=findings(evidence_of(f, result)))
+    evidence = evidence_of(f, result)
+    judged = replace(result, checks=findings(evidence))
+    if judged.verdict != "rejected":
+        # where nothing fits, the ball's place and with it the size that it should have mean nothing
+        require_ball_size(evidence.ball_size)
+    return judged
 
 
 def evidence_of(f: Fitted, result: Calibration) -> Evidence:
@@ -164,14 +171,17 @@ def evidence_of(f: Fitted, result: Calibration) -> Evidence:
         size=more.size,
         run_effects=more.run_effects,
         open_turns=more.open_turns,
+        ball_size=ball_size_of(f),
     )
 
 
-def with_findings(calibration: Calibration, more: tuple[Finding, ...]) -> Calibration:
-    """The calibration with findings of checks that need more than its own data, in place of older ones of the same
-    rules."""
-    rules = {finding.rule for finding in more}
-    return replace(calibration, checks=(*(f for f in calibration.checks if f.rule not in rules), *more))
+def ball_size_of(f: Fitted) -> BallSize | None:
+    """What the silhouettes of the rows used say about the magnification."""
+    used = f.linear.problem
+    P = f.view_matrices
+    if P is None:
+        P = chain_matrices(used, adjusted_scanners(used.scanners, f.free, f.delta), f.T_HT)
+    return measured_ball_size(used, P, f.balls[used.ball])
 
 
 def parameter_list(f: Fitted) -> tuple[Parameter, ...]:

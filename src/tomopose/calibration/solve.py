@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from tomopose.calibration.build import Fitted, build, expected_px, magnification_at_balls
-from tomopose.calibration.checks.convention_tests import Diagnosis, ranked, set_pose_rival
-from tomopose.calibration.checks.conventions import RIVALS, Rival
+from tomopose.calibration.checks.alternative import Alternative
+from tomopose.calibration.checks.convention_tests import Diagnosis, ranked, set_pose_alternative
+from tomopose.calibration.checks.conventions import ALTERNATIVES
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS
 from tomopose.calibration.model.covariance import widening
 from tomopose.calibration.model.parameters import (
@@ -137,7 +138,7 @@ def calibrate(
     fix: Sequence[str] = (),
     priors: Mapping[str, float] | None = None,
     robust: bool = True,
-    hypotheses: bool | Sequence[Rival] = True,
+    hypotheses: bool | Sequence[Alternative] = True,
     pose_noise: Any = "auto",
     distances: Mapping[tuple[int, int], tuple[float, float]] | None = None,
     raise_on_failure: bool = True,
@@ -156,7 +157,8 @@ def calibrate(
     free, fix:    names of scanner parameters to estimate or to hold; see `parameters.UNITS`.
     priors:       name -> prior standard deviation (mm, px, rad), in place of the scanner's.
     robust:       set aside centres that do not belong, and list them.
-    hypotheses:   try the cheap rival conventions (or those given) and say so in the verdict.
+    hypotheses:   try the cheap alternative conventions (or those given) and say so in the verdict; all of them
+                  where neither these nor the declared one fit.
     pose_noise:   scatter of the manipulator about the poses it reports: "auto" estimates it where the residuals are
                   significantly above what the centres' covariances explain; (mm, rad) states it; None has none.
     distances:    (ball id, ball id) -> (distance, standard uncertainty), mm: scale bars.  With them the balls are
@@ -219,7 +221,7 @@ def rigid_calibration(
     fix: Sequence[str] = (),
     priors: Mapping[str, float] | None = None,
     robust: bool = True,
-    hypotheses: bool | Sequence[Rival] = True,
+    hypotheses: bool | Sequence[Alternative] = True,
     pose_noise: str | tuple[float, float] | None = "auto",
     raise_on_failure: bool = True,
     arrangement: Arrangement = "moving-object",
@@ -231,10 +233,11 @@ def rigid_calibration(
     solution = with_pose_noise(stated, pose_noise, robust=robust)
     diagnosis = None
     if hypotheses:
-        other = set_pose_rival(problem, poses)
-        known = RIVALS if isinstance(hypotheses, bool) else hypotheses
-        quick = [r for r in (*known, *([other] if other else [])) if r.quick]
-        diagnosis = ranked(stated.used, freed, stated.fit, quick, starts=0)
+        other = set_pose_alternative(problem, poses)
+        known = [*(ALTERNATIVES if isinstance(hypotheses, bool) else hypotheses), *([other] if other else [])]
+        diagnosis = ranked(stated.used, freed, stated.fit, [a for a in known if a.quick], starts=0)
+        if diagnosis.nothing_fits:
+            diagnosis = ranked(stated.used, freed, stated.fit, known, starts=0)
     arguments = {
         "free": list(free),
         "fix": list(fix),

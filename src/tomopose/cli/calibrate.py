@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tomopose.cli.common import BallOption, PosesOption, ScannerOption, SourcePosesOption, arguments, either, names
+from tomopose.cli.common import PosesOption, ScannerOption, SourcePosesOption, arguments, either, names
 from tomopose.cli.options import ObservedOptions, WritingOptions, add_command
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ EPILOG = (
     "Twin robots: tomopose calibrate --twin twin.json --poses detector.csv --source-poses source.csv --scanner "
     "scanner.json --observations observations.csv --out cal/"
 )
+USUAL_BALL_MM = 8.0
 ARRANGEMENTS = ("moving-object", "moving-scanner")
 
 SCALE_BAR = re.compile(r"(?P<a>\d+),(?P<b>\d+)=(?P<mm>\d+\.?\d*)\((?P<u>\d*\.?\d+)\)")
@@ -39,7 +40,14 @@ class Options(ObservedOptions, WritingOptions):
     scanner: ScannerOption
     poses: PosesOption
     out: Annotated[Path, typer.Option("--out", help="Folder for calibration.json, observations.csv, report.html.")]
-    ball_diameter: BallOption = 8.0
+    ball_diameter: Annotated[
+        float | None,
+        typer.Option(
+            "--ball-diameter-mm",
+            min=0.0,
+            help="Diameter of the ball, mm; with observations that hold semi axes it checks the magnification.",
+        ),
+    ] = None
     manipulator: Annotated[
         Path | None, typer.Option("--manipulator", help="hexapod.json or robot.json: nominal geometry and its priors.")
     ] = None
@@ -142,14 +150,16 @@ def read_inputs(o: Options) -> Inputs:
     poses = tp.read_poses(o.poses, forward=forward_of(manipulator if twin is None else twin.detector))
     images = None
     if o.observations is not None:
-        observations = tp.read_observations(o.observations)
+        observations = tp.read_observations(o.observations).with_ball_diameter(o.ball_diameter)
     else:
         images = open_for(
             o.say, image_source(str(o.images)), scanner, poses,
             dark=o.dark, flat=o.flat, dataset=o.dataset, rows=o.rows, raw=o.raw,
         )  # fmt: skip
         note_missing_flat(o.say, o.flat)
-        observations = observe(o.say, scanner, images, poses, ball_diameter=o.ball_diameter, workers=o.workers)
+        observations = observe(
+            o.say, scanner, images, poses, ball_diameter=o.ball_diameter or USUAL_BALL_MM, workers=o.workers
+        )
     return Inputs(
         scanner=scanner, poses=poses, observations=observations, images=images, manipulator=manipulator, twin=twin
     )
@@ -187,8 +197,6 @@ def calibrate(options: Options) -> int:
     Exit code 3 says that the calibration finished but is not trustworthy; the report leads with the reasons.
     """
     import tomopose as tp
-    from tomopose.calibration.build import with_findings
-    from tomopose.calibration.checks.ball_size import ball_size_findings
     from tomopose.cli.job import calibration_summary, exit_code, require_free_folder, write_calibration_folder
     from tomopose.manipulator.error_models import RigidErrors
     from tomopose.provenance import provenance
@@ -202,8 +210,6 @@ def calibrate(options: Options) -> int:
     result = solve(o, given)
     # Where the scanner moves, the chain runs through the inverse poses.
     shown = tp.inverse_poses(given.poses) if o.moving_scanner or given.twin is not None else given.poses
-    if given.images is not None and given.twin is None and result.verdict != "rejected":
-        result = with_findings(result, ball_size_findings(result, shown, given.observations, o.ball_diameter))
     made = provenance(
         inputs=[p for p in (o.scanner, o.poses, o.observations, o.manipulator, o.twin, o.source_poses) if p],
         arguments=arguments(
@@ -211,7 +217,7 @@ def calibrate(options: Options) -> int:
             free=o.free,
             fix=o.fix,
             distance=o.distance,
-            ball_diameter_mm=o.ball_diameter,
+            ball_diameter_mm=given.observations.ball_diameter,
             images=None if o.images is None else len(given.observations),
             arrangement="twin" if given.twin is not None else o.arrangement,
             d_sd_sigma_mm=o.distance_sigma or None,

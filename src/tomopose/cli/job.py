@@ -122,7 +122,7 @@ def observe(
         found = tp.detect(
             images, scanner, ball_diameter=ball_diameter, pose_id=ids, workers=workers, progress=progress, **options
         )
-    return replace(found, image=tuple(Path(name).name for name in images.names))
+    return replace(found, image=tuple(Path(name).name for name in images.names), ball_diameter=ball_diameter)
 
 
 def worst(calibration: Calibration, observations: BallObservations, images: Any) -> tuple[Thumbnail, ...]:

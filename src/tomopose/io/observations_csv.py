@@ -21,6 +21,7 @@ from tomopose.units import Array
 REQUIRED = ("pose_id", "u_px", "v_px", "sigma_u_px", "sigma_v_px")
 NUMBERS = {"snr": "snr", "semi_major": "semi_major_px", "semi_minor": "semi_minor_px", "angle": "angle_rad"}
 ELLIPSE = ("u_ellipse_px", "v_ellipse_px")
+DIAMETER = "ball_diameter_mm"
 COVARIANCE = "cov_uv_px2"
 KNOWN = (*REQUIRED, "image", "seen", "status", *NUMBERS.values(), *ELLIPSE, COVARIANCE)
 SMALLEST_SIGMA_PX, LARGEST_SIGMA_PX = 1e-9, 1e4
@@ -62,6 +63,7 @@ def read_observations(path: str | Path) -> BallObservations:
             status=table.words("status") if "status" in table.columns else None,
             image=table.words("image") if "image" in table.columns else None,
             x_ellipse=np.column_stack([table.numbers(c, blank=anywhere) for c in ELLIPSE]) if all(ellipse) else None,
+            ball_diameter=_ball_diameter(table),
             **numbers,
         )
     except InputError as error:
@@ -79,6 +81,16 @@ def _require_known(table: TextTable) -> None:
     missing = [c for c in REQUIRED if c not in table.columns]
     if missing:
         raise InputError(f"{table.path}: columns {', '.join(missing)} are missing; found {', '.join(table.columns)}")
+
+
+def _ball_diameter(table: TextTable) -> float | None:
+    text = table.comments.get(DIAMETER)
+    if text is None:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"{table.path}: {DIAMETER} is {text!r}; a number of millimetres is needed") from None
 
 
 def _seen(table: TextTable) -> list[bool]:
@@ -148,4 +160,5 @@ def write_observations(
             columns[column] = np.where(np.isfinite(values), values, np.nan).tolist()
     if obs.x_ellipse is not None:
         columns |= {c: obs.x_ellipse[:, k].tolist() for k, c in enumerate(ELLIPSE)}
-    write_text(path, format_table(dict(comments), columns))
+    diameter = {} if obs.ball_diameter is None else {DIAMETER: repr(obs.ball_diameter)}
+    write_text(path, format_table(diameter | dict(comments), columns))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from tomopose.calibration.checks.convention_tests import BETTER, Diagnosis, Hypothesis, ranked
-from tomopose.calibration.checks.conventions import RIVALS
+from tomopose.calibration.checks.conventions import ALTERNATIVES
 from tomopose.calibration.model.parameters import UNITS, free_parameters
 from tomopose.calibration.model.problem import Problem, pair
 from tomopose.calibration.rigid.estimate import best_fit
@@ -96,7 +96,7 @@ def telling(everything: Problem, index: Any, unresolved: Iterable[Hypothesis], n
     """
     held = free_parameters(everything.scanners, fix=tuple(UNITS))
     part = everything.select(index)
-    by_name = {r.name: r for r in RIVALS}
+    by_name = {r.name: r for r in ALTERNATIVES}
     found: list[int] = []
     for h in unresolved:
         changed, all_changed = (by_name[h.name].change(p) for p in (part, everything))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.checks.conventions import RIVALS_OF_MOVING_SCANNER
+from tomopose.calibration.checks.conventions import ALTERNATIVES_OF_MOVING_SCANNER
 from tomopose.calibration.identified.calibrate import calibrate_kinematic, machine_of
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.result import Calibration, ViewDistances
@@ -78,7 +78,7 @@ def calibrate_inverse(
             scanner,
             turned,
             observations,
-            hypotheses=RIVALS_OF_MOVING_SCANNER,
+            hypotheses=ALTERNATIVES_OF_MOVING_SCANNER,
             arrangement="moving-scanner",
             free=free,
             fix=fix,

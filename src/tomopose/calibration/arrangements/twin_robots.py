@@ -144,21 +144,27 @@ def calibrate_twin(
         everything=data,
         arrangement="twin",
         magnification_at_ball=_magnification_at_balls(fits[chosen]),
+        view_matrices=_view_matrices(fits[chosen]),
         source_poses=twin.source_poses.select(twin.source_poses.index_of(data.pose_id)),
         provenance=provenance(arguments={"model": model}),
     )
 
 
-def _magnification_at_balls(fit: ModelFit) -> float:
-    """Mean over the views of d_SD over the ball's distance from the focal spot, along the panel's normal."""
+def _view_matrices(fit: ModelFit) -> Array:
+    """(n, 3, 4): from the balls' frame to pixels, of the views used."""
     e = fit.estimate
     twin = e.problem.model
     if not isinstance(twin, TwinRobots):
         raise TypeError(f"a fit of twin robots is needed; its model is {type(twin).__name__}")
+    return twin_view_matrices(e.problem.data.scanner, twin, T_HT=e.state.T_HT, poses=e.problem.poses, p=e.state.p)
+
+
+def _magnification_at_balls(fit: ModelFit) -> float:
+    """Mean over the views of d_SD over the ball's distance from the focal spot, along the panel's normal."""
+    e = fit.estimate
     data, scanner = e.problem.data, e.problem.data.scanner
-    P = twin_view_matrices(scanner, twin, T_HT=e.state.T_HT, poses=e.problem.poses, p=e.state.p)
     own = ProjectionMatrices(
-        P=P,
+        P=_view_matrices(fit),
         n_u=scanner.n_u,
         n_v=scanner.n_v,
         p_u=scanner.p_u,

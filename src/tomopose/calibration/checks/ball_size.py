@@ -1,21 +1,20 @@
 """The ball as a gauge: does its silhouette have the size that the calibrated chain and its diameter give?
 
 The magnification that a calibration finds comes from the manipulator's translations; a wrong scale of theirs moves the
-centres as another mount would. The ball's diameter is a length of its own, and its silhouette shows the difference.
+centres as another mount would.  With the table at one angle any scale fits: positions in centimetres leave the same
+residuals as millimetres.  The ball's diameter is a length of its own, and its silhouette shows the difference.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Protocol
-
 import numpy as np
 
-from tomopose.calibration.checks.rules import BallSize, Evidence, ball_size_rules, findings
-from tomopose.calibration.checks.verdict import Finding
-from tomopose.errors import InputError
+from tomopose.calibration.checks.conventions import POSITION_UNITS
+from tomopose.calibration.checks.rules import BallSize
+from tomopose.calibration.model.problem import Problem, pair
+from tomopose.calibration.result import Calibration
+from tomopose.errors import InputError, UnitError
 from tomopose.geometry.scanner import Scanner
-from tomopose.geometry.silhouette import silhouette_ellipse
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
@@ -24,56 +23,83 @@ from tomopose.units import Array
 WRONG = 0.02
 """Relative difference of size from which a value that was given must be wrong: two pixels at a radius of 100 px."""
 
-
-class Placed(Protocol):
-    """Where a calibration puts the balls."""
-
-    @property
-    def scanner(self) -> Scanner: ...
-    @property
-    def T_HT(self) -> RigidTransform: ...
-    @property
-    def balls(self) -> Mapping[int, Array]: ...
-    @property
-    def pose_id(self) -> tuple[str, ...]: ...
-    @property
-    def model(self) -> str: ...
-    @property
-    def arrangement(self) -> str: ...
+UNIT_TOLERANCE = 0.05
+"""A size that is off by the factor of a unit of length within this is off by that unit; the diameter may be wrong by a
+few per cent besides.  The nearest factors, 10 and 25.4, are far apart."""
 
 
-def size_ratio(calibration: Placed, poses: PoseSequence, observations: BallObservations, ball_diameter: float) -> float:
+def chain_matrices(problem: Problem, scanners: tuple[Scanner, ...], T_HT: RigidTransform) -> Array:
+    """(n, 3, 4): from the moved plate M to pixels, of every row's pose as reported."""
+    T_MH = np.zeros((len(problem), 4, 4))
+    T_MH[:, :3, :3], T_MH[:, :3, 3], T_MH[:, 3, 3] = problem.R_MH, problem.t_MH, 1.0
+    P = np.empty((len(problem), 3, 4))
+    for r, scanner in enumerate(scanners):
+        mine = problem.run == r
+        P[mine] = scanner.P_S @ scanner.T_WS.matrix @ scanner.T_TW(problem.alpha[mine]).matrix
+    return P @ T_HT.matrix @ T_MH
+
+
+def silhouette_outlines(P: Array, centres: Array, diameter: float) -> Array:
+    """(n,) px^2: product of the semi axes of the silhouettes of balls at centres (n, 3), under P (n, 3, 4).
+
+    The dual quadric of a sphere, x x^T - r^2 diag(1, 1, 1, 0), has the dual conic P Q P^T as its outline (Hartley and
+    Zisserman, Multiple View Geometry, sec. 8.3), which gives the ellipse's centre and shape.
+    """
+    x = np.concatenate([centres, np.ones((len(centres), 1))], axis=1)
+    Q = x[:, :, None] * x[:, None, :]
+    Q[:, range(3), range(3)] -= (diameter / 2.0) ** 2
+    C = P @ Q @ np.swapaxes(P, 1, 2)
+    C = C / C[:, 2:, 2:]
+    m = C[:, :2, 2]
+    return np.sqrt(np.maximum(np.linalg.det(m[:, :, None] * m[:, None, :] - C[:, :2, :2]), 0.0))
+
+
+def measured_ball_size(problem: Problem, P: Array, centres: Array) -> BallSize | None:
+    """The gauge of rows whose outline was measured; None without outlines or without the ball's diameter.
+
+    P (n, 3, 4): from the balls' frame to pixels;  centres (n, 3): of the ball of each row.
+    """
+    if problem.outline is None or problem.ball_diameter is None:
+        return None
+    known = np.isfinite(problem.outline)
+    if not known.any():
+        return None
+
+    def ratio(factor: float) -> float:
+        # a scene in another unit throws the silhouettes of a ball that is smaller by this factor
+        calculated = silhouette_outlines(P[known], centres[known], problem.ball_diameter / factor)
+        with np.errstate(divide="ignore"):
+            return float(np.sqrt(np.median(problem.outline[known] / calculated)))
+
+    own = ratio(1.0)
+    agreeing = (u for u in POSITION_UNITS if abs(ratio(u[2]) - 1.0) < UNIT_TOLERANCE)
+    unit = None if abs(own - 1.0) <= WRONG else next(agreeing, None)
+    return BallSize(ratio=own, diameter=problem.ball_diameter, unit=unit)
+
+
+def size_ratio(
+    calibration: Calibration, poses: PoseSequence, observations: BallObservations, ball_diameter: float
+) -> float:
     """Median over the poses used of the measured size of the silhouette over the calculated one; NaN without sizes.
 
-    calibration: of one ball.  poses: those of its chain as commanded (inverse ones where the scanner moves).
+    poses: those of the calibration's chain as commanded (inverse ones where the scanner moves).
     """
-    if observations.semi_major is None or observations.semi_minor is None:
-        return float("nan")
-    chain = poses.select(poses.index_of(calibration.pose_id))
-    scanner, row = calibration.scanner, {name: k for k, name in enumerate(observations.pose_id)}
-    (ball,) = calibration.balls.values()
-    T_MS = scanner.T_WS @ scanner.T_TW(np.asarray(chain.alpha)) @ calibration.T_HT @ chain.T_MH
-    sizes = []
-    for x_S, name in zip(T_MS.apply(ball), calibration.pose_id, strict=True):
-        x = scanner.K @ x_S
-        gamma = np.arcsin(ball_diameter / 2.0 / np.linalg.norm(x_S))
-        _, major, minor, _ = silhouette_ellipse(scanner, x[:2] / x[2], gamma)
-        k = row[name]
-        sizes.append(observations.semi_major[k] * observations.semi_minor[k] / (major * minor))
-    return float(np.sqrt(np.nanmedian(sizes)))
+    used = observations.select(np.isin(observations.pose_id, calibration.pose_id))
+    problem = pair(calibration.scanner, poses, used.with_ball_diameter(ball_diameter))
+    centres = np.array([calibration.balls[i] for i in problem.ball_ids])[problem.ball]
+    size = measured_ball_size(problem, chain_matrices(problem, problem.scanners, calibration.T_HT), centres)
+    return float("nan") if size is None else size.ratio
 
 
-def ball_size_findings(
-    calibration: Placed, poses: PoseSequence, observations: BallObservations, ball_diameter: float
-) -> tuple[Finding, ...]:
-    """What the silhouettes say, by the rules; arguments as of `size_ratio`.
-
-    InputError where the size is off by more than 2 %.
-    """
-    size = BallSize(ratio=size_ratio(calibration, poses, observations, ball_diameter), diameter=ball_diameter)
-    found = findings(
-        Evidence.of_ball_size(size, model=calibration.model, arrangement=calibration.arrangement), ball_size_rules()
-    )
-    if abs(size.ratio - 1.0) > WRONG:
-        raise InputError(size.words)
-    return found
+def require_ball_size(size: BallSize | None) -> None:
+    """InputError where the size is off by more than 2 %; UnitError where it is off by the factor of a unit."""
+    if size is None or abs(size.ratio - 1.0) <= WRONG:
+        return
+    if size.unit is not None:
+        name, symbol, factor = size.unit
+        raise UnitError(
+            f"the positions look like {name} ({symbol}), not millimetres: with millimetres the ball's silhouettes are "
+            f"{100 * size.ratio:.2g} % of those of a ball of {size.diameter:g} mm where the calibration places it, "
+            f"with {name} they agree; multiply x_mm, y_mm and z_mm of the pose table by {factor:g}"
+        )
+    raise InputError(size.words)

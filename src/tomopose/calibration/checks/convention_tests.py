@@ -52,10 +52,6 @@ BELONGING = 0.8
 BELONGING_MEAN = 2.0 * (1.0 - (1.0 - BELONGING) * np.log(1.0 / (1.0 - BELONGING)) / BELONGING)
 """Mean of the smallest BELONGING of chi2 values with 2 degrees of freedom (exponential, mean 2): 1.195."""
 
-MEANINGLESS_SHARE = 0.02
-"""Residuals above this share of the centres' spread: the poses explain the images hardly better than chance.  The rigid
-model of an uncalibrated hexapod leaves 0.006 (1.5 px of 250 px), wrong conventions leave 0.1 to 0.7."""
-
 ITERATIONS = 20
 """An alternative that is right needs fewer; one that is wrong is not worth more."""
 
@@ -79,7 +75,7 @@ class Hypothesis:
     fit best;  delta: see above, 0 for the declared reading;  factor: chi2 of the declared reading over the
     alternative's, both floored at dof;  outcome: declared | better | same | worse | unfit;  symmetry: no plan could
     distinguish it;  length_factor: of `Alternative`;  ball_mm: distance of the ball from the focal spot, median;
-    off_axis: |ln| of ball_mm over d_SR;  possible: every ball is between focal spot and panel.
+    d_SR: of the scanner, mm;  possible: every ball is between focal spot and panel.
     """
 
     name: str
@@ -88,19 +84,20 @@ class Hypothesis:
     d_rms: float
     chi2: float
     dof: int
-    sigmas: float
     delta: float
     factor: float
     outcome: str
+    sigmas: float = 0.0
     symmetry: bool = False
     length_factor: float = 1.0
-    ball_mm: float = float("nan")
-    off_axis: float = float("inf")
+    ball_mm: float = 0.0
+    d_SR: float = 0.0
     possible: bool = True
 
     @property
-    def cure(self) -> str:
-        return self.remedy
+    def off_axis(self) -> float:
+        """|ln| of ball_mm over d_SR; inf where a ball cannot be there."""
+        return float(abs(np.log(self.ball_mm / self.d_SR))) if self.ball_mm > 0 < self.d_SR else float("inf")
 
     @property
     def fits(self) -> bool:
@@ -121,6 +118,10 @@ class Hypothesis:
             "outcome": self.outcome,
             "verdict": WORDS[self.outcome],
             "symmetry": self.symmetry,
+            "length_factor": self.length_factor,
+            "ball_mm": self.ball_mm,
+            "d_SR_mm": self.d_SR,
+            "possible": self.possible,
         }
 
 
@@ -128,13 +129,11 @@ class Hypothesis:
 class Diagnosis:
     """Hypotheses ranked by fit, best first; the declared reading is among them.
 
-    spread: px, rms distance of the centres from their mean.
     better: alternatives that fit significantly better;  same: those that these poses cannot distinguish from the
     declared reading.
     """
 
     hypotheses: tuple[Hypothesis, ...]
-    spread: float = float("inf")
 
     def named(self, outcome: str) -> tuple[Hypothesis, ...]:
         return tuple(h for h in self.hypotheses if h.outcome == outcome)
@@ -161,11 +160,6 @@ class Diagnosis:
     def nothing_fits(self) -> bool:
         """Whether every reading, the declared one included, leaves more than `FITS_SIGMAS`."""
         return not any(h.fits for h in self.hypotheses)
-
-    @property
-    def meaningless(self) -> bool:
-        """Whether nothing fits and the declared reading explains the images hardly better than chance."""
-        return self.nothing_fits and self.declared.d_rms > MEANINGLESS_SHARE * self.spread
 
     @property
     def as_declared(self) -> bool:
@@ -288,7 +282,7 @@ class _Declared:
             factor=1.0,
             outcome="declared",
             ball_mm=self.placed.median,
-            off_axis=self.placed.off_axis,
+            d_SR=self.placed.d_SR,
             possible=self.placed.possible,
         )
 
@@ -321,8 +315,7 @@ def ranked(
         judged = _judged_beside_movements(declared, alternative, changed, other)
         if judged is not None:
             found.append(judged)
-    spread = float(np.sqrt(((problem.x_D - problem.x_D.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    return Diagnosis(hypotheses=tuple(sorted(found, key=_rank)), spread=spread)
+    return Diagnosis(hypotheses=tuple(sorted(found, key=_rank)))
 
 
 def _rank(h: Hypothesis) -> tuple[int, float]:
@@ -388,7 +381,7 @@ def _judged(
         symmetry=alternative.symmetry,
         length_factor=alternative.length_factor,
         ball_mm=placed.median,
-        off_axis=placed.off_axis,
+        d_SR=placed.d_SR,
         possible=placed.possible,
     )
 
@@ -440,6 +433,3 @@ def diagnose(
     other = set_pose_alternative(problem, runs)
     known = ALTERNATIVES_OF_MOVING_SCANNER if moving_scanner else ALTERNATIVES
     return ranked(problem, freed, fit, [*known, *([other] if other else [])])
-
-
-set_pose_rival = set_pose_alternative

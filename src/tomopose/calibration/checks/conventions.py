@@ -84,7 +84,9 @@ def _lag(lag: int) -> Change:
             return None
         image, pose = (np.array(column) for column in zip(*pairs, strict=True))
         of_pose, of_image = p.select(pose), p.select(image)
-        return replace(of_pose, x_D=of_image.x_D, covariance=of_image.covariance, W=of_image.W)
+        return replace(
+            of_pose, x_D=of_image.x_D, covariance=of_image.covariance, W=of_image.W, outline=of_image.outline
+        )
 
     return change
 
@@ -305,5 +307,3 @@ def _over_inverse(alternative: Alternative) -> Alternative:
 
 ALTERNATIVES_OF_MOVING_SCANNER = tuple(_over_inverse(alternative) for alternative in ALTERNATIVES)
 """The same readings of a table whose inverse poses are those of the problem."""
-
-RIVALS, RIVALS_OF_MOVING_SCANNER, Rival = ALTERNATIVES, ALTERNATIVES_OF_MOVING_SCANNER, Alternative

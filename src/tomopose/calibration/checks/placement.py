@@ -7,11 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.rigid.estimate import LIKELY
 from tomopose.calibration.rigid.fit import Fit
 from tomopose.units import Array
-
-LIKELY = 2.5
-"""A ball on the manipulator is taken to be within this factor of the rotation axis' distance from the focal spot."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
-from tomopose.calibration.checks.convention_tests import BETTER, MUCH_BETTER, Diagnosis
+from tomopose.calibration.checks.convention_tests import BETTER, MUCH_BETTER, Diagnosis, other_unit_words
 from tomopose.calibration.checks.stability import SIGNIFICANT, Effect, Stability
 from tomopose.calibration.checks.verdict import Finding, Verdict
 from tomopose.calibration.model.covariance import WIDENING_PROBABILITY
@@ -43,10 +43,12 @@ class AgainstRigid:
 
 @dataclass(frozen=True, kw_only=True)
 class BallSize:
-    """ratio: measured size of the ball's silhouettes over the calculated one;  diameter: mm, as it was given."""
+    """ratio: measured size of the ball's silhouettes over the calculated one;  diameter: mm, as it was given;
+    unit: (name, symbol, millimetres) of the unit of the positions under which they agree, where that is another one."""
 
     ratio: float
     diameter: float
+    unit: tuple[str, str, float] | None = None
 
     @property
     def words(self) -> str:
@@ -98,28 +100,6 @@ class Evidence:
     run_effects: bool = False
     open_turns: str = ""
     ball_size: BallSize | None = None
-
-    @classmethod
-    def of_ball_size(cls, ball_size: BallSize, *, model: str, arrangement: str) -> Evidence:
-        """The evidence of the silhouettes alone, for `ball_size_rules`; every other value is unknown."""
-        unknown = float("nan")
-        return cls(
-            model=model,
-            arrangement=arrangement,
-            converged=False,
-            finite=False,
-            dof=0,
-            n_used=0,
-            outliers=(),
-            misfit=False,
-            chi2=unknown,
-            chi2_dof=unknown,
-            widened=False,
-            residual_px=unknown,
-            expected_px=unknown,
-            spread_px=unknown,
-            ball_size=ball_size,
-        )
 
     @property
     def n(self) -> int:
@@ -222,6 +202,23 @@ def _alternatives(e: Evidence, much: bool) -> Iterator[Found]:
                 f"limit {-BETTER:g}; d_rms {h.d_rms:.3g} px instead of {e.residual_px:.3g} px); to try: {h.remedy}",
                 remedy=h.remedy,
             )
+
+
+def _other_unit(e: Evidence, limit: float) -> Iterator[Found]:
+    h = e.diagnosis.other_unit if e.diagnosis else None
+    gauged = e.ball_size is not None and abs(e.ball_size.ratio - 1.0) < limit
+    if h is not None and not gauged:
+        yield Found(value=h.length_factor, words=other_unit_words(h, e.diagnosis.declared), remedy=h.remedy)
+
+
+def _no_place(e: Evidence, limit: float) -> Iterator[Found]:
+    if e.diagnosis and not e.diagnosis.declared.possible:
+        yield Found(
+            value=e.diagnosis.declared.ball_mm,
+            words=f"the calibration places the ball {e.diagnosis.declared.ball_mm:.4g} mm from the focal spot, and in "
+            "some pose not between focal spot and panel: the unit or the sense of the translations, or d_SD, is wrong",
+            remedy="check the unit of x_mm, y_mm, z_mm and d_SD_mm",
+        )
 
 
 def _misfit(e: Evidence, limit: float) -> Iterator[Found]:
@@ -440,12 +437,32 @@ RULES: tuple[Rule, ...] = (
         measure=_nothing_fits,
     ),
     Rule(
+        name="place of the ball",
+        condition="a ball is not between focal spot and panel in every pose",
+        limit=NONE,
+        verdict="rejected",
+        reason="no radiograph shows a ball that is anywhere else",
+        measure=_no_place,
+        arrangements=("moving-object", "moving-scanner"),
+    ),
+    Rule(
+        name="unit of the positions",
+        condition="another unit of the positions fits as well and places the ball nearer to the rotation axis, and no "
+        "silhouette agrees with millimetres within {limit:.0%}",
+        limit=0.02,
+        verdict="doubtful",
+        reason="with the table at one angle every scale fits; a ball is within a factor of 2.5 of d_SR from the focal "
+        "spot",
+        measure=_other_unit,
+        arrangements=("moving-object", "moving-scanner"),
+    ),
+    Rule(
         name="alternative convention, better",
         condition=f"an alternative convention fits better by {np.sqrt(BETTER):.0f} sigma (delta chi2 below {{limit:g}}"
         ")",
         limit=-BETTER,
         verdict="doubtful",
-        reason="5 sigma: some 40 alternatives are tried",
+        reason="5 sigma: some 65 alternatives are tried",
         measure=lambda e, limit: _alternatives(e, False),
         arrangements=("moving-object", "moving-scanner"),
     ),
@@ -619,7 +636,6 @@ RULES: tuple[Rule, ...] = (
         verdict="doubtful",
         reason="a pixel of edge position at a radius of 100 px, far above what the detection leaves",
         measure=_ball_size,
-        arrangements=("moving-object", "moving-scanner"),
     ),
     Rule(
         name="size of the ball, noted",
@@ -628,7 +644,6 @@ RULES: tuple[Rule, ...] = (
         verdict="trustworthy",
         reason="half a pixel of edge position at a radius of 100 px, as blur may cause",
         measure=lambda e, limit: _ball_size(e, limit, BALL_SIZE),
-        arrangements=("moving-object", "moving-scanner"),
     ),
 )
 
@@ -636,11 +651,6 @@ RULES: tuple[Rule, ...] = (
 def findings(evidence: Evidence, rules: tuple[Rule, ...] = RULES) -> tuple[Finding, ...]:
     """Everything that the rules find, in the order of the table."""
     return tuple(finding for rule in rules for finding in rule.findings(evidence))
-
-
-def ball_size_rules() -> tuple[Rule, ...]:
-    """The rules that need silhouettes, and nothing but them."""
-    return tuple(rule for rule in RULES if rule.name.startswith("size of the ball"))
 
 
 def rules_table(rules: tuple[Rule, ...] = RULES) -> str:

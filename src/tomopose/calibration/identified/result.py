@@ -165,9 +165,11 @@ def calibration_of(
     diagnosis: Diagnosis | None = None,
     source_poses: PoseSequence | None = None,
     views: ViewDistances | None = None,
+    view_matrices: Array | None = None,
     provenance: Provenance | None = None,
 ) -> Calibration:
-    """The calibration by the model `chosen`.  everything: all rows that were paired, those set aside too."""
+    """The calibration by the model `chosen`.  everything: all rows that were paired, those set aside too;
+    view_matrices: of `build.Fitted`."""
     fit = fits[chosen]
     e = fit.estimate
     problem, model = e.problem, e.problem.model
@@ -206,6 +208,7 @@ def calibration_of(
             comparison=comparison(judged, fits, chosen),
             views=views,
             magnification_at_ball=magnification_at_ball,
+            view_matrices=view_matrices,
             provenance=provenance,
         )
     )

@@ -31,6 +31,7 @@ class Problem:
     not_seen: ids of poses whose ball was not measured, with the reason.
     orientations (n, 3 or 4): the orientation columns as written, in the convention's unit, or None.
     units_confirmed: the user says that unusual magnitudes of the poses are right.
+    outline (n,): product of the semi axes of the silhouettes, px^2, NaN where unknown;  ball_diameter: mm; or None.
     """
 
     scanners: tuple[Scanner, ...]
@@ -51,6 +52,8 @@ class Problem:
     convention: str = "pi-hexapod"
     orientations: Array | None = None
     units_confirmed: bool = False
+    outline: Array | None = None
+    ball_diameter: float | None = None
 
     def __len__(self) -> int:
         return len(self.pose_id)
@@ -77,6 +80,7 @@ class Problem:
             pose_id=tuple(self.pose_id[i] for i in k),
             time_utc=None if self.time_utc is None else tuple(self.time_utc[i] for i in k),
             orientations=None if self.orientations is None else self.orientations[k],
+            outline=None if self.outline is None else self.outline[k],
         )
 
     def with_covariance(self, covariance: Array) -> Problem:
@@ -105,6 +109,12 @@ def _written_orientations(runs: Sequence[PoseSequence], rows: Sequence[Array]) -
             return None
         parts.append(poses.orientations[k])
     return np.concatenate(parts)
+
+
+def _one_diameter(runs: Sequence[BallObservations]) -> float | None:
+    """The diameter that all runs state; None where one states none or another."""
+    stated = {o.ball_diameter for o in runs}
+    return stated.pop() if len(stated) == 1 else None
 
 
 def _as_runs(value: Any, kind: type) -> list[Any]:
@@ -136,7 +146,7 @@ def pair(
         if np.abs(other - pivots[0]).max() > PIVOT_TOLERANCE_MM:
             raise InputError(f"the runs have different pivots, {pivots[0]} and {other} mm; H differs between them")
     several = len(runs_p) > 1
-    parts: dict[str, list[Any]] = {k: [] for k in ("R", "t", "alpha", "run", "index", "ball", "x", "C")}
+    parts: dict[str, list[Any]] = {k: [] for k in ("R", "t", "alpha", "run", "index", "ball", "x", "C", "outline")}
     ids: list[str] = []
     times: list[str] = []
     not_seen: dict[str, str] = {}
@@ -157,6 +167,7 @@ def pair(
         parts["ball"].append(np.asarray(p.ball_id)[k])
         parts["x"].append(o.x_D[rows])
         parts["C"].append(o.covariance[rows])
+        parts["outline"].append(np.full(len(rows), np.nan) if o.outline is None else o.outline[rows])
         ids += [prefix + p.pose_id[i] for i in k]
         if p.time_utc is not None:
             times += [p.time_utc[i] for i in k]
@@ -190,4 +201,6 @@ def pair(
         convention=runs_p[0].convention,
         orientations=_written_orientations(runs_p, parts["index"]),
         units_confirmed=all(p.units_confirmed for p in runs_p),
+        outline=np.concatenate(parts["outline"]),
+        ball_diameter=_one_diameter(runs_o),
     )

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from tomopose.calibration.checks.conventions import POSITION_UNITS
 from tomopose.calibration.model.covariance import inverse_information, significant, widening
 from tomopose.calibration.model.parameters import UNITS, FreeParameters, free_parameters
 from tomopose.calibration.model.problem import Problem
@@ -15,8 +16,11 @@ from tomopose.calibration.rigid.observability import cure, unobservable_directio
 from tomopose.calibration.rigid.outliers import RobustFit, robust_fit
 from tomopose.calibration.rigid.pose_noise import PoseNoise, estimate_pose_noise, total_covariance
 from tomopose.calibration.rigid.start import closed_form, other_starts, ray_equations
-from tomopose.errors import InputError, NotConvergedError, NotObservableError
+from tomopose.errors import InputError, NotConvergedError, NotObservableError, UnitError
 from tomopose.units import Array
+
+LIKELY = 2.5
+"""A ball on the manipulator is taken to be within this factor of the rotation axis' distance from the focal spot."""
 
 COLLAPSED = 1e-3
 """A ball nearer to the source than this part of d_SR is none that anybody imaged."""
@@ -80,6 +84,18 @@ def require_observable(problem: Problem, free: FreeParameters, J: Array) -> None
         )
 
 
+def require_no_other_unit(distance: float, d_SR: float) -> None:
+    """UnitError where another unit of the positions has the ball near the rotation axis; distance: mm, to the spot."""
+    off_axis = {u: abs(np.log(max(distance * u[2], 1e-300) / d_SR)) for u in POSITION_UNITS}
+    name, symbol, factor = min(off_axis, key=lambda u: off_axis[u])
+    if off_axis[name, symbol, factor] < np.log(LIKELY):
+        raise UnitError(
+            f"the positions look like {name} ({symbol}), not millimetres: millimetres place the ball at the focal spot "
+            f"({distance:.3g} mm from it), {name} {distance * factor:.4g} mm from it, near the rotation axis (d_SR "
+            f"{d_SR:g} mm); multiply x_mm, y_mm and z_mm of the pose table by {factor:g}"
+        )
+
+
 def require_length(problem: Problem, fit: Fit) -> None:
     """NotObservableError where the ball has fallen into the source: without any length an optimum may shrink at will.
 
@@ -88,7 +104,10 @@ def require_length(problem: Problem, fit: Fit) -> None:
     scanner = problem.scanners[problem.run[0]]
     source = (scanner.T_WS @ scanner.T_TW(float(problem.alpha[0]))).inv.t
     ball = fit.R_HT @ (problem.R_MH[0] @ fit.t[problem.ball[0]] + problem.t_MH[0]) + fit.t_HT
-    if np.linalg.norm(ball - source) < COLLAPSED * scanner.d_SR:
+    distance = float(np.linalg.norm(ball - source))
+    if distance < COLLAPSED * scanner.d_SR:
+        if not problem.units_confirmed:
+            require_no_other_unit(distance, scanner.d_SR)
         direction = "the size of t_HT and t: every distance from the source may be shrunk alike"
         raise NotObservableError(
             f"the poses do not determine the calibration: {direction}; add poses that translate, another table angle, "

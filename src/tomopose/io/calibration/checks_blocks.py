@@ -53,12 +53,7 @@ def finding_from(row: Mapping[str, Any]) -> Finding:
 
 
 def hypothesis_document(h: Hypothesis) -> dict[str, Any]:
-    more = {name: encode(getattr(h, name)) for name in ("length_factor", "ball_mm", "off_axis")}
-    return (
-        {name: encode(v) if isinstance(v, float) else v for name, v in h.to_json().items()}
-        | more
-        | {"possible": h.possible}
-    )
+    return {name: encode(v) if isinstance(v, float) else v for name, v in h.to_json().items()}
 
 
 def hypothesis_from(row: Mapping[str, Any]) -> Hypothesis:
@@ -75,8 +70,8 @@ def hypothesis_from(row: Mapping[str, Any]) -> Hypothesis:
         outcome=row.get("outcome", "worse"),
         symmetry=bool(row.get("symmetry", False)),
         length_factor=number(row.get("length_factor", 1.0)),
-        ball_mm=number(row.get("ball_mm")),
-        off_axis=number(row.get("off_axis", "inf")),
+        ball_mm=number(row.get("ball_mm", 0.0)),
+        d_SR=number(row.get("d_SR_mm", 0.0)),
         possible=bool(row.get("possible", True)),
     )
 
