@@ -81,6 +81,19 @@ def diagnosis(*, factor: float, delta: float, outcome: str) -> Diagnosis:
     return Diagnosis(hypotheses=(other, declared))
 
 
+def with_readings(*, declared: Mapping[str, Any] = {}, other: Mapping[str, Any] = {}) -> Diagnosis:
+    """A clean diagnosis whose readings differ in these values."""
+    two, one = diagnosis(factor=1.0, delta=40.0, outcome="worse").hypotheses
+    return Diagnosis(hypotheses=(replace(two, **other), replace(one, **declared)))
+
+
+def test_a_silhouette_that_agrees_with_millimetres_settles_the_unit():
+    e = clean()
+    doubt = with_readings(other={"outcome": "same", "length_factor": 10.0, "ball_mm": 300.0})
+    assert findings(replace(e, diagnosis=doubt)) == ()
+    assert [f.rule for f in findings(replace(e, diagnosis=doubt, ball_size=None))] == ["unit of the positions"]
+
+
 def moved(e: Evidence, *, at: str) -> dict[str, Any]:
     assert e.stability is not None
     effect = Effect(name="mount", p=1e-9, size_px=0.4, share=0.9, words="the mount changed", at=at)
@@ -102,6 +115,11 @@ def met(name: str, e: Evidence) -> Mapping[str, Any]:
         "nothing fits": {"residual_px": 40.0},
         "alternative convention, much better": {"diagnosis": diagnosis(factor=3.0, delta=-800.0, outcome="better")},
         "alternative convention, better": {"diagnosis": diagnosis(factor=1.2, delta=-60.0, outcome="better")},
+        "place of the ball": {"diagnosis": with_readings(declared={"ball_mm": 5000.0, "possible": False})},
+        "unit of the positions": {
+            "diagnosis": with_readings(other={"outcome": "same", "length_factor": 10.0, "ball_mm": 300.0}),
+            "ball_size": None,
+        },
         "many centres do not fit": {"misfit": True},
         "outliers": {"outliers": tuple(str(k) for k in range(28)), "n_used": 161},
         "block of outliers": {
