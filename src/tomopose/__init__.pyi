@@ -86,6 +86,7 @@ from .measurement.features.feature import Feature as Feature
 from .measurement.measure import measure as measure
 from .measurement.mesh.mesh import Mesh as Mesh
 from .measurement.mesh.mesh_files import read_mesh as read_mesh
+from .measurement.plan import AcceptancePlan as AcceptancePlan
 from .measurement.plan import AlignmentPlan as AlignmentPlan
 from .measurement.plan import FeaturePlan as FeaturePlan
 from .measurement.plan import LimitPlan as LimitPlan
@@ -93,9 +94,11 @@ from .measurement.plan import MeasurandPlan as MeasurandPlan
 from .measurement.plan import MeasurementPlan as MeasurementPlan
 from .measurement.plan import SpheresPlan as SpheresPlan
 from .measurement.plan import SurfacePlan as SurfacePlan
+from .measurement.plan import UncertaintyPlan as UncertaintyPlan
 from .measurement.plan import read_plan as read_plan
 from .measurement.probing import Probing as Probing
 from .measurement.probing import probe as probe
+from .measurement.result import Decision as Decision
 from .measurement.results import MeasurementResult as MeasurementResult
 from .measurement.results import MeasurementResults as MeasurementResults
 from .measurement.results import Repeat as Repeat
