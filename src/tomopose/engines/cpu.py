@@ -11,7 +11,7 @@ import numpy as np
 
 from tomopose.engines import kernels, vector
 from tomopose.engines.geometry import index_geometry
-from tomopose.engines.kernels import BORDER, MARGIN, TILE
+from tomopose.engines.kernels import BORDER, MARGIN, TILE, Lookup, Rays, Support
 from tomopose.engines.protocol import Availability, Limits, Weight, require_images, require_support, require_views
 from tomopose.errors import InputError
 from tomopose.geometry.projection import ProjectionMatrices
@@ -56,12 +56,7 @@ class CpuEngine:
             )
         self.matrices, self.grid = matrices, grid
         support = require_support(support, grid)
-        self._support = (
-            np.zeros(0, dtype=np.uint8)
-            if support is None
-            else np.ascontiguousarray(support.transpose(2, 1, 0), dtype=np.uint8).reshape(-1)
-        )
-        self._layers = layers_of(support, grid)
+        self._support = Support(inside=inside_of(support), layers=layers_of(support, grid))
         self.threads = processors() if threads is None else threads
         self.vector = kernels == "vector"
         self._geometry = index_geometry(matrices, grid)
@@ -86,12 +81,9 @@ class CpuEngine:
         lines = np.empty((len(views), self.matrices.n_u, self.matrices.n_v), dtype=np.float32)
         flat = state.reshape(-1)
         for image, j in zip(lines, views, strict=True):
-            source, M_inv = self._geometry.source[j], self._geometry.M_inv[j]
 
-            def part(
-                start: int, stop: int, image: np.ndarray = image, s: np.ndarray = source, M: np.ndarray = M_inv
-            ) -> None:
-                kernels.forward_columns(flat, self.grid.n_xyz, self.grid.spacing, s, M, image, self.vector, start, stop)
+            def part(start: int, stop: int, image: np.ndarray = image, rays: Rays = self._rays(j)) -> None:
+                kernels.forward_columns(flat, rays, image, self.vector, start, stop)
 
             self._share(part, self.matrices.n_u, RAY_COLUMNS)
         return lines.transpose(0, 2, 1)
@@ -116,26 +108,19 @@ class CpuEngine:
             bordered[:, i], bordered[:, -1 - i] = bordered[:, BORDER], bordered[:, -1 - BORDER]
         for i in range(BORDER):
             bordered[:, :, i], bordered[:, :, -1 - i] = bordered[:, :, BORDER], bordered[:, :, -1 - BORDER]
-        P = self._geometry.P[np.asarray(views, dtype=np.intp)]
-        flat, pixels = into.reshape(-1), bordered.reshape(m, -1)
+        look = Lookup(
+            P=self._geometry.P[np.asarray(views, dtype=np.intp)],
+            images=bordered.reshape(m, -1),
+            n_u=n_u,
+            n_v=n_v,
+            scale=float(scale),
+            inverse_square=weight == "inverse-square",
+            vector=self.vector and self.grid.shape[0] >= vector.W,
+        )
+        flat, mean = into.reshape(-1), weight == "mean"
 
         def part(start: int, stop: int) -> None:
-            kernels.back_columns(
-                flat,
-                self.grid.n_xyz,
-                P,
-                pixels,
-                (n_u, n_v),
-                scale,
-                weight == "inverse-square",
-                weight == "mean",
-                nonnegative,
-                self._support,
-                self._layers,
-                self.vector,
-                start,
-                stop,
-            )
+            kernels.back_columns(flat, self.grid.n_xyz, look, mean, nonnegative, self._support, start, stop)
 
         self._share(part, self.grid.n_xyz[0], TILE)
 
@@ -144,21 +129,12 @@ class CpuEngine:
         state = self.empty()
         flat = state.reshape(-1)
         for image, j in zip(images, views, strict=True):
-            lines = np.ascontiguousarray(image.T)
-            source, M_inv = self._geometry.source[j], self._geometry.M_inv[j]
-            for axis in range(3):
+            lines, rays = np.ascontiguousarray(image.T), self._rays(j)
+            for axis, n in enumerate(self.grid.n_xyz):
 
-                def part(
-                    start: int,
-                    stop: int,
-                    axis: int = axis,
-                    lines: np.ndarray = lines,
-                    s: np.ndarray = source,
-                    M: np.ndarray = M_inv,
-                ) -> None:
-                    kernels.scatter_planes(flat, self.grid.n_xyz, self.grid.spacing, s, M, lines, axis, start, stop)
+                def part(start: int, stop: int, axis: int = axis, lines: np.ndarray = lines, rays: Rays = rays) -> None:
+                    kernels.scatter_planes(flat, rays, lines, axis, start, stop)
 
-                n = self.grid.n_xyz[axis]
                 self._share(part, n, max(TILE, n // (2 * self.threads)))
         for axis in range(3):
             edge = np.moveaxis(state, axis, 0)
@@ -169,16 +145,17 @@ class CpuEngine:
         require_views(views, len(self.matrices))
         lines = np.empty((len(views), self.matrices.n_u, self.matrices.n_v), dtype=np.float32)
         for image, j in zip(lines, views, strict=True):
-            kernels.ray_lengths(
-                self.grid.n_xyz,
-                self.grid.spacing,
-                self._geometry.source[j],
-                self._geometry.M_inv[j],
-                image,
-                0,
-                self.matrices.n_u,
-            )
+            kernels.ray_lengths(self._rays(j), image, 0, self.matrices.n_u)
         return lines.transpose(0, 2, 1)
+
+    def _rays(self, j: int) -> Rays:
+        """View j as the kernels need it."""
+        return Rays(
+            shape=self.grid.n_xyz,
+            spacing=self.grid.spacing,
+            source=self._geometry.source[j],
+            M_inv=self._geometry.M_inv[j],
+        )
 
     def _share(self, part: Callable[[int, int], None], n: int, chunk: int) -> None:
         """part(start, stop) over 0 .. n, in pieces of `chunk`, on all threads."""
@@ -191,6 +168,13 @@ class CpuEngine:
 
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "_pool": None}
+
+
+def inside_of(support: np.ndarray | None) -> np.ndarray:
+    """Flat [x, y, z], 1 inside the support; empty without one."""
+    if support is None:
+        return np.zeros(0, dtype=np.uint8)
+    return np.ascontiguousarray(support.transpose(2, 1, 0), dtype=np.uint8).reshape(-1)
 
 
 def layers_of(support: np.ndarray | None, grid: VoxelGrid) -> np.ndarray:

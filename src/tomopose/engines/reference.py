@@ -61,6 +61,7 @@ class ReferenceEngine:
         on_plane = np.arange(3) == axis[:, None, None]
         place = np.where(on_plane, k[:, None], place)
         used = k < n[axis][:, None]
+        place = np.clip(np.nan_to_num(place, nan=-1.0), -1.0, n)  # beyond, all weights are 0
         base = np.floor(place).astype(np.int64)
         fraction = place - base
         indices, weights = [], []
@@ -110,7 +111,7 @@ class ReferenceEngine:
             uv = project(P, x)
             w = x @ P[2, :3] + P[2, 3]
             seen = (uv > -1).all(axis=1) & (uv[:, 0] < n_u) & (uv[:, 1] < n_v)
-            u, v = np.clip(uv[:, 0], 0, n_u - 1), np.clip(uv[:, 1], 0, n_v - 1)
+            u, v = (np.clip(np.where(seen, uv[:, i], 0), 0, n - 1) for i, n in enumerate((n_u, n_v)))
             i, k = np.minimum(u.astype(int), max(n_u - 2, 0)), np.minimum(v.astype(int), max(n_v - 2, 0))
             f_u, f_v = u - i, v - k
             i_1, k_1 = np.minimum(i + 1, n_u - 1), np.minimum(k + 1, n_v - 1)

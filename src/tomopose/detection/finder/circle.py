@@ -157,9 +157,10 @@ def _disc_contrast(image, u, v, radius, sign, aspect):  # type: ignore[no-untype
     sample, n_disc, n_around = np.empty((2, 2 * RAYS)), 0, 0
     for r in (0.25 * radius, 0.5 * radius, radius + max(0.15 * radius, 2.0)):
         for k in range(RAYS):
-            i, j = round(u + r * COS[k]), round(v + r * SIN[k] / aspect)
-            if not (0 <= i < image.shape[1] and 0 <= j < image.shape[0]):
+            x, y = u + r * COS[k], v + r * SIN[k] / aspect
+            if not (-0.5 <= x < image.shape[1] - 0.5 and -0.5 <= y < image.shape[0] - 0.5):
                 continue
+            i, j = round(x), round(y)
             if r < radius:
                 sample[0, n_disc] = image[j, i]
                 n_disc += 1

@@ -147,10 +147,12 @@ def thinned_ring(  # type: ignore[no-untyped-def]
             middle, reach = u_c - u_first, math.sqrt(rest) / ratio_u
             gap = low * low - dv * dv if low > 0.0 else -1.0
             hole = math.sqrt(gap) / ratio_u if gap > 0.0 else -1.0
-            first, last = max(0, math.ceil(middle - reach)), min(columns - 1, math.floor(middle + reach))
+            first = math.ceil(min(max(middle - reach, 0.0), float(columns)))
+            last = math.floor(min(max(middle + reach, -1.0), columns - 1.0))
             for side in range(2):
-                start = first if side == 0 else max(first, math.ceil(middle + hole))
-                stop = min(last, math.floor(middle - hole)) if side == 0 and hole >= 0.0 else last
+                start = first if side == 0 else max(first, math.ceil(min(max(middle + hole, 0.0), float(columns))))
+                inner = math.floor(min(max(middle - hole, -1.0), columns - 1.0))
+                stop = min(last, inner) if side == 0 and hole >= 0.0 else last
                 if side == 1 and hole < 0.0:
                     break
                 for i in range(start + (-start - 2 * j) % every, stop + 1, every):
@@ -179,7 +181,7 @@ def by_sector(u, v, value, rim, low, high, thin_from, k, edges, more):  # type: 
     cell, part = np.empty(u.shape[0], np.int64), np.empty(u.shape[0])
     for i in range(u.shape[0]):
         angle = _direction(rim[4, i], rim[5, i]) * turn
-        node = min(int(angle), k - 1)
+        node = int(min(max(angle, 0.0), k - 1.0))
         cell[i], part[i] = node * shells, angle - node
     first = np.zeros(k * shells + 1, np.int64)
     for i in range(u.shape[0]):

@@ -57,7 +57,7 @@ def _on_edge(  # type: ignore[no-untyped-def]
     last = profile.shape[0] - 2
     for i in range(start, stop):
         x = (rim[0, i] - first) * per_step
-        j = min(max(int(x), 0), last)
+        j = int(min(max(x, 0.0), float(last)))
         f = min(max(x - j, 0.0), 1.0)
         O = profile[j, 0] + f * (profile[j + 1, 0] - profile[j, 0])
         O1 = profile[j, 1] + f * (profile[j + 1, 1] - profile[j, 1])

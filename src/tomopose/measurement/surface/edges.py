@@ -190,8 +190,7 @@ def _piece(
     longer = LONGER if settings.window is None and settings.plateau_radius > 0 else 0.0
     reach = settings.search_distance + 2 + window + max(window, longer + 2.5 * sigma + 1)
     reach = reach * np.abs(step).max(axis=0)
-    low = np.maximum(np.floor(index.min(axis=0) - reach).astype(int) - REACH, 0)
-    high = np.minimum(np.ceil(index.max(axis=0) + reach).astype(int) + REACH + 1, volume.grid.shape)
+    low, high = _part(index, reach, volume.grid.shape)
     if (high - low < 4).any():
         return np.full((len(index), kernel.N_COLUMNS), np.nan), np.full(len(index), kernel.BORDER, dtype=np.uint8)
     part = volume.values[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
@@ -199,6 +198,13 @@ def _piece(
     return kernel.search_lines(
         coefficients, index - low, step, sigma, window, settings.search_distance, settings.method == "esf", longer
     )
+
+
+def _part(index: Array, reach: Array, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """First voxel, and the one after the last, of the part of the volume about edges at index (n, 3)."""
+    low = np.clip(np.floor(index.min(axis=0) - reach) - REACH, 0, shape)
+    high = np.clip(np.ceil(index.max(axis=0) + reach) + REACH + 1, 0, shape)
+    return low.astype(int), high.astype(int)
 
 
 def _estimated_sigma(volume: Volume, index: Array, step: Array, settings: EdgeSettings) -> float:
@@ -211,8 +217,7 @@ def _estimated_sigma(volume: Volume, index: Array, step: Array, settings: EdgeSe
     rows = np.flatnonzero(slab == np.argmax(np.bincount(slab)))
     rows = rows[:: max(len(rows) // SIGMA_SAMPLE, 1)]
     reach = (settings.search_distance + 2 * _window(settings, SIGMA_RANGE[1]) + 2) * np.abs(step).max(axis=0)
-    low = np.maximum(np.floor(index[rows].min(axis=0) - reach).astype(int) - REACH, 0)
-    high = np.minimum(np.ceil(index[rows].max(axis=0) + reach).astype(int) + REACH + 1, volume.grid.shape)
+    low, high = _part(index[rows], reach, volume.grid.shape)
     coefficients = spline_coefficients(volume.values[low[0] : high[0], low[1] : high[1], low[2] : high[2]])
     sigma = START_SIGMA
     for _ in range(SIGMA_ROUNDS):

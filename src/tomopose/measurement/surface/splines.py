@@ -150,7 +150,7 @@ def smoothed_gradients(values: Any, index: Any, sigma: Any) -> Any:
         taps = np.empty((3, 3, 2 * reach + 1))
         centre = np.empty(3, dtype=np.int64)
         for a in range(3):
-            centre[a] = round(index[n, a])
+            centre[a] = round(min(max(index[n, a], -1.0 * reach), values.shape[a] - 1.0 + reach))
             _gauss(index[n, a], sigma, centre[a], reach, taps[a])
         for k in range(2 * reach + 1):
             z = min(max(centre[0] - reach + k, 0), values.shape[0] - 1)
@@ -180,7 +180,7 @@ def smoothed_curvatures(values: Any, index: Any, spacing: Any, sigma: Any) -> An
         taps = np.empty((3, 3, 2 * reach + 1))
         centre = np.empty(3, dtype=np.int64)
         for a in range(3):
-            centre[a] = round(index[n, a])
+            centre[a] = round(min(max(index[n, a], -1.0 * reach), values.shape[a] - 1.0 + reach))
             _gauss(index[n, a], sigma, centre[a], reach, taps[a])
         g, H = np.zeros(3), np.zeros((3, 3))
         for k in range(2 * reach + 1):

@@ -77,8 +77,10 @@ def _depth_buffer(
             continue
         u_0, u_1 = min(x[i, 0], x[j, 0], x[k, 0]), max(x[i, 0], x[j, 0], x[k, 0])
         v_0, v_1 = min(x[i, 1], x[j, 1], x[k, 1]), max(x[i, 1], x[j, 1], x[k, 1])
-        for v in range(max(int(np.ceil(v_0)), 0), min(int(np.floor(v_1)), n_v - 1) + 1):
-            for u in range(max(int(np.ceil(u_0)), 0), min(int(np.floor(u_1)), n_u - 1) + 1):
+        u_0, u_1 = min(max(u_0, 0.0), float(n_u)), min(max(u_1, -1.0), n_u - 1.0)
+        v_0, v_1 = min(max(v_0, 0.0), float(n_v)), min(max(v_1, -1.0), n_v - 1.0)
+        for v in range(int(np.ceil(v_0)), int(np.floor(v_1)) + 1):
+            for u in range(int(np.ceil(u_0)), int(np.floor(u_1)) + 1):
                 a = ((x[j, 0] - u) * (x[k, 1] - v) - (x[j, 1] - v) * (x[k, 0] - u)) / area
                 b = ((x[k, 0] - u) * (x[i, 1] - v) - (x[k, 1] - v) * (x[i, 0] - u)) / area
                 c = 1.0 - a - b

@@ -75,6 +75,15 @@ def projected(
 
 
 @njit(cache=True, nogil=True, inline="always")
+def held(x: float, low: int, high: int) -> float:
+    """x within low .. high, as a float, before it becomes an index: int() of what an edge that is nearly level, or far
+    off the panel, gives would be undefined.  NaN gives low."""
+    if x >= high:
+        return float(high)
+    return x if x > low else float(low)
+
+
+@njit(cache=True, nogil=True, inline="always")
 def _edge(x: np.ndarray, y: np.ndarray, a: int, b: int) -> Any:
     """(lower y, upper y, y, x, slope, direction) of the edge from a to b: x(y) = x + (y - y_a) slope, from the corner
     with the smaller number; direction 1 where it rises."""
@@ -105,7 +114,7 @@ def fill(P: Arrays, j_0: int, j_1: int, Q: np.ndarray, seen: np.ndarray) -> None
     for t in range(len(faces)):
         a, b, c = faces[t]
         lo, hi = min(y[a], y[b], y[c]), max(y[a], y[b], y[c])
-        first, last = max(int(np.ceil(lo)), j_0), min(int(np.ceil(hi)), j_1)
+        first, last = int(np.ceil(held(lo, j_0, j_1))), int(np.ceil(held(hi, j_0, j_1)))
         if first >= last or max(x[a], x[b], x[c]) < 0 or min(x[a], x[b], x[c]) > n_u:
             continue
         h_a, h_x, h_y, least, most = _plane(x, y, h, a, b, c)
@@ -122,7 +131,7 @@ def fill(P: Arrays, j_0: int, j_1: int, Q: np.ndarray, seen: np.ndarray) -> None
                         down = at
             left, right, way = (up, down, -sign) if up < down else (down, up, sign)
             here = h_a + (j - y[a]) * h_y
-            for i in range(int(np.ceil(max(left, 0.0))), int(np.ceil(min(right, float(n_u))))):
+            for i in range(int(np.ceil(held(left, 0, n_u))), int(np.ceil(held(right, 0, n_u)))):
                 Q[j, i, m] += way / min(max(here + (i - x[a]) * h_x, least), most)
                 seen[j, i] += s
 
@@ -140,7 +149,7 @@ def touching(
     for t in range(len(faces)):
         a, b, c = faces[t]
         lo, hi = min(y[a], y[b], y[c]), max(y[a], y[b], y[c])
-        first, last = max(int(np.floor(lo)), j_0), min(int(np.floor(hi)) + 1, j_1)
+        first, last = int(held(np.floor(lo), j_0, j_1)), int(held(np.floor(hi) + 1, j_0, j_1))
         if first >= last or max(x[a], x[b], x[c]) < 0 or min(x[a], x[b], x[c]) > n_u:
             continue
         edges = (_edge(x, y, a, b), _edge(x, y, b, c), _edge(x, y, c, a))
@@ -156,7 +165,7 @@ def touching(
                     left, right = min(left, at_0, at_1), max(right, at_0, at_1)
             if right < left:
                 left, right = min(x[a], x[b], x[c]), max(x[a], x[b], x[c])
-            for i in range(max(int(np.floor(left)), 0), min(int(np.floor(right)) + 1, n_u)):
+            for i in range(int(held(np.floor(left), 0, n_u)), int(held(np.floor(right) + 1, 0, n_u))):
                 if wanted[j, i]:
                     if len(lists):
                         lists[start[j, i] + count[j, i]] = t

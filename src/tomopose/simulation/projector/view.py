@@ -85,8 +85,9 @@ def shadow(
     the detector; None where there are none."""
     boxes = shadow_boxes(outlines, view, T_FW)
     lo, hi = np.floor(boxes[:, 0].min(axis=0)) - margin, np.ceil(boxes[:, 1].max(axis=0)) + margin
-    u_0, v_0 = max(int(lo[0]), -margin), max(int(lo[1]), -margin)
-    u_1, v_1 = min(int(hi[0]) + 1, scanner.n_u + margin), min(int(hi[1]) + 1, scanner.n_v + margin)
+    size = np.array([scanner.n_u, scanner.n_v])
+    u_0, v_0 = (int(x) for x in np.clip(lo, -margin, size + margin))
+    u_1, v_1 = (int(x) for x in np.clip(hi + 1, -margin, size + margin))
     seen = u_1 > max(u_0, 0) and v_1 > max(v_0, 0) and u_0 < scanner.n_u and v_0 < scanner.n_v
     return Window(u_0=u_0, v_0=v_0, n_u=u_1 - u_0, n_v=v_1 - v_0) if seen else None
 

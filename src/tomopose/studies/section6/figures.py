@@ -138,7 +138,7 @@ def around(found: Found, mesh: Mesh) -> Figure:
     """Fig. 12: deviation of the cylinder areas by direction about the rotation axis."""
     chosen = cylinder_areas(mesh)
     phi = np.degrees(azimuth(mesh)[chosen]) % 360
-    cell = (phi / 360 * ANGLES).astype(int)
+    cell = np.minimum(phi / 360 * ANGLES, ANGLES - 1).astype(int)  # -1e-20 % 360 is 360
     data = []
     for name, case in panels("specimen").items():
         d = deviations(found, case)[chosen]

@@ -59,8 +59,10 @@ def _add_balls(
             v = (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3]) / w
             u_low, u_high, v_low, v_high = min(u_low, u), max(u_high, u), min(v_low, v), max(v_high, v)
         o_x, o_y, o_z = s[0] - c[0], s[1] - c[1], s[2] - c[2]
-        for v in range(max(int(v_low), 0), min(int(v_high) + 2, n_v)):
-            for u in range(max(int(u_low), 0), min(int(u_high) + 2, n_u)):
+        u_low, u_high = min(max(u_low, 0.0), float(n_u)), min(max(u_high + 2, 0.0), float(n_u))
+        v_low, v_high = min(max(v_low, 0.0), float(n_v)), min(max(v_high + 2, 0.0), float(n_v))
+        for v in range(int(v_low), int(v_high)):
+            for u in range(int(u_low), int(u_high)):
                 d_x = inverse[0, 0] * u + inverse[0, 1] * v + inverse[0, 2]
                 d_y = inverse[1, 0] * u + inverse[1, 1] * v + inverse[1, 2]
                 d_z = inverse[2, 0] * u + inverse[2, 1] * v + inverse[2, 2]
