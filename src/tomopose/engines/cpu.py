@@ -81,8 +81,9 @@ class CpuEngine:
         lines = np.empty((len(views), self.matrices.n_u, self.matrices.n_v), dtype=np.float32)
         flat = state.reshape(-1)
         for image, j in zip(lines, views, strict=True):
+            rays = self._rays(j)
 
-            def part(start: int, stop: int, image: np.ndarray = image, rays: Rays = self._rays(j)) -> None:
+            def part(start: int, stop: int, image: np.ndarray = image, rays: Rays = rays) -> None:
                 kernels.forward_columns(flat, rays, image, self.vector, start, stop)
 
             self._share(part, self.matrices.n_u, RAY_COLUMNS)

@@ -33,9 +33,12 @@ BORDER = 2
 TILE = 16
 F32 = np.float32
 STEEP = 2.0**20
-"""Pixels times w_max / w_min of a column's layers up to which a vector block is used.  A block's float32 depth is off by
-2 eps w_max at most, eps = 2^-24, its quotient u (counted from a pixel of the detector) by u (2 eps w_max / w_min + 2
-eps) < 4 eps n w_max / w_min: a quarter of a pixel at the limit, and the border beyond the last seen place is one."""
+"""Pixels times w_max / w_min of a column's layers up to which a vector block is used.
+
+A block's float32 depth is off by 2 eps w_max at most, eps = 2^-24, its quotient u (counted from a pixel of the
+detector) by u (2 eps w_max / w_min + 2 eps) < 4 eps n w_max / w_min: a quarter of a pixel at the limit.  The border
+beyond the last seen place is one pixel wide.
+"""
 
 
 class Lookup(NamedTuple):
