@@ -111,7 +111,8 @@ class Volume:
     grid:           where the voxels lie.
     view_residual:  (n,) rms over the detector of measured minus reprojected line integral, per view, in the images'
                     order; divided by the rms of the measured ones.  None where no reprojection was made.
-    notes:          what a reader has to know: short scan, truncation, approximations, suspicious views.
+    contradicted:   indices of views whose residual is absurd: the volume does not explain them.
+    notes:          what a reader has to know: the algorithm chosen and why, short scan, truncation, suspicious views.
     settings:       how it was made.
     """
 
@@ -121,6 +122,7 @@ class Volume:
     notes: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
     provenance: Provenance | None = None
+    contradicted: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if self.values.shape != self.grid.shape:
@@ -129,11 +131,17 @@ class Volume:
             raise ShapeError(f"values are {self.values.dtype}; a volume is float32")
         if self.view_residual is not None:
             object.__setattr__(self, "view_residual", float_array(self.view_residual))
+        object.__setattr__(self, "contradicted", tuple(int(j) for j in self.contradicted))
         object.__setattr__(self, "notes", tuple(self.notes))
         object.__setattr__(self, "settings", dict(self.settings))
 
     def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> np.ndarray:
         return self.values.astype(dtype or self.values.dtype, copy=bool(copy))
+
+    @property
+    def trustworthy(self) -> bool:
+        """Whether the volume contradicts none of the views that it was made from."""
+        return not self.contradicted
 
     def slices(self, at: Any = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Three orthogonal slices through voxel `at` (iz, iy, ix), the middle unless given: [y, x], [z, x], [z, y]."""

@@ -57,6 +57,7 @@ class Engine(Protocol):
 
     name: str
     limits: Limits
+    grid: VoxelGrid
 
     def empty(self) -> State:
         """A volume of zeros."""

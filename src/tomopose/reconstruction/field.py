@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import shutil
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -37,6 +37,24 @@ def every_nth_pixel(matrices: ProjectionMatrices, stride: int) -> ProjectionMatr
     )
 
 
+def wider_panel(matrices: ProjectionMatrices, beyond: tuple[int, int]) -> ProjectionMatrices:
+    """The matrices of images with `beyond` columns added (below column 0, above the last)."""
+    below, above = beyond
+    shift = np.array([[1.0, 0.0, below], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    return replace(matrices, P=shift @ matrices.P, n_u=matrices.n_u + below + above, points_sigma=None, scanner=None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adding:
+    """How a back-projection is added: as `Engine.back`; beyond: columns by which the images are wider than the panel,
+    see `wider_panel`."""
+
+    weight: Weight
+    scale: float = 1.0
+    nonnegative: bool = False
+    beyond: tuple[int, int] = (0, 0)
+
+
 class Field(Protocol):
     """The volume under reconstruction.  Images are (m, n_v, n_u) float32, as for an engine."""
 
@@ -47,9 +65,9 @@ class Field(Protocol):
     def sampled(self, views: Sequence[int], stride: int) -> np.ndarray:
         """`forward` at every stride-th pixel of every stride-th row only."""
 
-    def back(
-        self, images: np.ndarray, views: Sequence[int], *, weight: Weight, scale: float, nonnegative: bool
-    ) -> None: ...
+    def back(self, images: np.ndarray, views: Sequence[int], how: Adding) -> None:
+        """Add a back-projection."""
+
     def lengths(self, views: Sequence[int]) -> np.ndarray:
         """A 1: lengths of the rays in the grid, or in the support where there is one."""
 
@@ -79,6 +97,7 @@ class Piece:
         self.state = self.engine.empty()
         self._inside = None if support is None else self.engine.put(support.astype(np.float32))
         self._sampling: dict[int, Engine] = {}
+        self._wider: dict[tuple[int, int], Engine] = {(0, 0): self.engine}
 
     def limits(self) -> Limits:
         return self.engine.limits
@@ -92,10 +111,14 @@ class Piece:
             self._sampling[stride] = make_engine(name, every_nth_pixel(matrices, stride), self.grid, **options)
         return self._sampling[stride].forward(self.state, views)
 
-    def back(
-        self, images: np.ndarray, views: Sequence[int], *, weight: Weight, scale: float, nonnegative: bool
-    ) -> None:
-        self.engine.back(images, views, into=self.state, weight=weight, scale=scale, nonnegative=nonnegative)
+    def back(self, images: np.ndarray, views: Sequence[int], how: Adding) -> None:
+        if how.beyond not in self._wider:
+            name, matrices, options = self._made
+            wide = wider_panel(matrices, how.beyond)
+            self._wider[how.beyond] = make_engine(name, wide, self.grid, support=self._support, **options)
+        self._wider[how.beyond].back(
+            images, views, into=self.state, weight=how.weight, scale=how.scale, nonnegative=how.nonnegative
+        )
 
     def lengths(self, views: Sequence[int]) -> np.ndarray:
         if self._inside is not None:
@@ -177,12 +200,10 @@ class DiskField:
     def lengths(self, views: Sequence[int]) -> np.ndarray:
         return self._sum("lengths", views, filled=False)
 
-    def back(
-        self, images: np.ndarray, views: Sequence[int], *, weight: Weight, scale: float, nonnegative: bool
-    ) -> None:
+    def back(self, images: np.ndarray, views: Sequence[int], how: Adding) -> None:
         for i in range(len(self._bounds)):
             piece = self._piece(i)
-            piece.back(images, views, weight=weight, scale=scale, nonnegative=nonnegative)
+            piece.back(images, views, how)
             store(self._file(i, self._generation + 1), piece.values())
         self._generation += 1
 
@@ -265,10 +286,8 @@ class DaskField:
     def lengths(self, views: Sequence[int]) -> np.ndarray:
         return self._sum("lengths", views)
 
-    def back(
-        self, images: np.ndarray, views: Sequence[int], *, weight: Weight, scale: float, nonnegative: bool
-    ) -> None:
-        self._all("back", np.ascontiguousarray(images), views, weight=weight, scale=scale, nonnegative=nonnegative)
+    def back(self, images: np.ndarray, views: Sequence[int], how: Adding) -> None:
+        self._all("back", np.ascontiguousarray(images), views, how)
 
     def save(self, folder: Path) -> None:
         for i, piece in enumerate(self._pieces):

@@ -23,27 +23,30 @@ LARGEST_HOLE = 25
 class Correction:
     """How an image becomes line integrals.
 
-    images_are:   "transmission" I/I_0, "line-integrals" -ln(I/I_0), or "counts" I with white level and dark.
+    images_are:   "transmission" I/I_0, "line-integrals" -ln(I/I_0), or "counts" I with white level and dark; None where
+                  the image sequence says it.
     white, dark:  counts without object and without beam: numbers or images (n_v, n_u).
     bad_pixels:   (n_v, n_u) bool: pixels without a say, in every view.
     invalid:      what to do with NaN, infinite and non-positive pixels elsewhere: "error", or "exclude" them from
                   their view as if they were bad.
     beam_hardening: coefficients c_1, c_2 ... of p' = c_1 p + c_2 p^2 + ..., rising over the data.
-    rings:        (n_v, n_u) offset that is subtracted from every view, see `ring_offset`; None for none.
+    ring_width:   window (px, odd) of `ring_offset`, by which rings are found; None for none.
+    rings:        (n_v, n_u) offset that is subtracted from every view, as `ring_offset` finds it; None for none.
     """
 
-    images_are: ImagesAre
+    images_are: ImagesAre | None = None
     white: Any = None
     dark: Any = 0.0
     bad_pixels: Any = None
     invalid: Literal["error", "exclude"] = "error"
     beam_hardening: tuple[float, ...] = ()
+    ring_width: int | None = None
     rings: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        if self.images_are not in KINDS:
+        if self.images_are is not None and self.images_are not in KINDS:
             raise ConventionError(f"images_are is {self.images_are!r}; one of {', '.join(KINDS)} is needed")
-        if (self.images_are == "counts") != (self.white is not None):
+        if self.images_are is not None and (self.images_are == "counts") != (self.white is not None):
             raise ConventionError(
                 "a white level is needed where images are counts, and only there "
                 f"(images_are={self.images_are!r}, white level {'given' if self.white is not None else 'missing'})"
@@ -51,6 +54,16 @@ class Correction:
         if self.invalid not in ("error", "exclude"):
             raise InputError(f"invalid is {self.invalid!r}; 'error' or 'exclude' is needed")
         object.__setattr__(self, "beam_hardening", tuple(float(c) for c in self.beam_hardening))
+
+    @property
+    def described(self) -> dict[str, object]:
+        """In words and numbers, for a volume's settings."""
+        return {
+            "images_are": self.images_are,
+            "invalid": self.invalid,
+            "beam_hardening": list(self.beam_hardening),
+            "ring_width": self.ring_width,
+        }
 
 
 def images_kind(images: Any, images_are: ImagesAre | None) -> ImagesAre:

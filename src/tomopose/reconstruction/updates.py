@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from tomopose.reconstruction.checkpoint import Checkpoint
-from tomopose.reconstruction.fdk import FdkFilter
-from tomopose.reconstruction.field import Field
+from tomopose.reconstruction.fdk.filter import FdkFilter
+from tomopose.reconstruction.field import Adding, Field
 from tomopose.reconstruction.line_integrals import LineIntegrals
 
 SHORTEST_RAY = 2.0
@@ -63,17 +63,18 @@ def sart_update(field: Field, *, relaxation: float, nonnegative: bool) -> Update
         for image, (_, bad, fill) in zip(residual, views, strict=True):
             if fill.shape[0]:
                 image[bad] = fill @ np.where(bad, 0, image).ravel()
-        field.back(residual, subset, weight="mean", scale=relaxation, nonnegative=nonnegative)
+        field.back(residual, subset, Adding(weight="mean", scale=relaxation, nonnegative=nonnegative))
 
     return update
 
 
-def fdk_update(field: Field, filtered: FdkFilter, *, nonnegative: bool) -> Update:
+def fdk_update(field: Field, filtered: FdkFilter) -> Update:
     """Add the views of a subset to the FDK sum."""
+    how = Adding(weight="inverse-square", beyond=filtered.beyond)
 
     def update(subset: Subset, views: list[Any]) -> None:
         images = stacked(filtered(p, j) for j, (p, _, _) in zip(subset, views, strict=True))
-        field.back(images, subset, weight="inverse-square", scale=1.0, nonnegative=nonnegative)
+        field.back(images, subset, how)
 
     return update
 
@@ -118,17 +119,6 @@ def run(
                 checkpoint.after(field, count)
             if progress:
                 progress(count, total)
-
-
-def view_residuals(field: Field, scan: LineIntegrals, samples: Samples) -> np.ndarray:
-    """(n,): rms of measured minus reprojected over the sampled pixels of each view, over the rms of the measured."""
-    residual = np.empty(len(scan))
-    for j in range(len(scan)):
-        p = samples.view(scan, j).astype(np.float64)
-        q = field.sampled((j,), samples.stride)[0]
-        size = float(np.sqrt((p**2).mean()))
-        residual[j] = np.sqrt(((p - q) ** 2).mean()) / size if size > 0 else 0.0
-    return residual
 
 
 def cgls(

@@ -15,17 +15,24 @@ CIRCULAR_ROLL = math.radians(1.0)
 """Up to these a path counts as circular: elevation of the source over its plane, and of detector rows against it."""
 STEEPEST = 1.5
 """Rise over run up to which a path counts as smooth."""
+HOLE = 3.0
+"""A stretch between neighbouring views counts as a hole from so many times the median on, and from twice the mean on:
+views that are spread unevenly have none."""
+FEWEST_SOURCES = 3
+"""Places of the source that it takes to determine a path."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourcePath:
-    """axis: (3,) unit normal of the best plane through the sources, in W; centre: (3,) mm, of the circle in it.
+    """The path, read off the matrices.
+
+    axis: (3,) unit normal of the best plane through the sources, in W; centre: (3,) mm, of the circle in it.
 
     angle: (n,) rad about the axis; weight: (n,) rad, the share of the turn of each view; arm: (n, 3) mm, from centre to
     source; distance: (n,) mm, its length; elevation: (n,) rad over the plane; tangent: (n, 3) mm/rad, how the source
-    moves with the angle; coverage: rad, the turn that is covered; circular: whether FDK's assumption holds; full_turn:
-    whether no gap stands out; smooth: whether the height is a smooth function of the angle, so that neighbours by angle
-    are neighbours on the way (not on two rings, or with scattered views).
+    moves with the angle; holes: (m, 2) rad, where each stretch without views begins and how long it is; circular:
+    whether the source keeps to its plane, and rows to it; smooth: whether the height is a smooth function of the angle,
+    so that neighbours by angle are neighbours on the way (not on two rings, or with scattered views).
     """
 
     axis: Array
@@ -36,17 +43,28 @@ class SourcePath:
     distance: Array
     elevation: Array
     tangent: Array
-    coverage: float
+    holes: Array
     circular: bool
-    full_turn: bool
     smooth: bool
 
+    @property
+    def full_turn(self) -> bool:
+        """Whether no stretch of the turn lacks views."""
+        return len(self.holes) == 0
 
-def source_path(matrices: ProjectionMatrices) -> SourcePath:
-    """The path of the source relative to the object."""
+    @property
+    def coverage(self) -> float:
+        """The turn that the views cover, rad."""
+        return float(self.weight.sum())
+
+
+def source_path(matrices: ProjectionMatrices) -> SourcePath | None:
+    """The path of the source relative to the object; None where fewer than three places do not determine one."""
     rays = matrices.decompose()
     source = rays.source
     mean = source.mean(axis=0)
+    if len(np.unique((source - mean).round(6), axis=0)) < FEWEST_SOURCES:
+        return None
     _, spread, axes = np.linalg.svd(source - mean, full_matrices=True)
     e_1, e_2, axis = axes
     if axis[np.abs(axis).argmax()] < 0:
@@ -61,10 +79,10 @@ def source_path(matrices: ProjectionMatrices) -> SourcePath:
     angle = np.arctan2(arm @ np.cross(axis, e_1), arm @ e_1)
     order = np.argsort(angle, kind="stable")
     gap = np.diff(angle[order], append=angle[order[0]] + 2 * math.pi)
-    largest, typical = float(gap.max()), float(np.median(gap))
-    full = bool(largest <= max(3 * typical, 4 * math.pi / len(angle)))
+    typical = float(np.median(gap))
+    hole = gap > max(HOLE * typical, 2 * (2 * math.pi / len(angle)))
     weight = np.empty(len(angle))
-    shared = gap if full else np.where(gap == largest, typical, gap)
+    shared = np.where(hole, typical, gap)
     weight[order] = (shared + np.roll(shared, 1)) / 2
     rows = rays.U / np.linalg.norm(rays.U, axis=1, keepdims=True)
     circular = (
@@ -86,9 +104,8 @@ def source_path(matrices: ProjectionMatrices) -> SourcePath:
         distance=distance,
         elevation=elevation,
         tangent=tangents(arm, axis, slope),
-        coverage=float(shared.sum()),
+        holes=np.stack([angle[order][hole] + typical / 2, gap[hole] - typical], axis=1),
         circular=circular,
-        full_turn=full,
         smooth=bool((np.abs(rise) < STEEPEST * run).all()),
     )
 

@@ -3,11 +3,12 @@ r"""Filtered back-projection from projection matrices, the ramp along the source
 Feldkamp, Davis and Kress (J. Opt. Soc. Am. A 1 (1984) 612), with the source at distance R from the centre of the path,
 the panel at distance d_SD along its own normal and w the depth of a voxel along that normal:
 
-    f(x) = 1/2 \sum_j \Delta\beta_j  (R_j d_SD / w_j^2)  q_j(u(x), v(x)),
-    q_j  = p_u \sum_n h_n  c p_j(u - n, v),   c = d_SD / sqrt(d_SD^2 + ((u - u_0) p_u)^2 + ((v - v_0) p_v)^2),
+    f(x) = \sum_j \Delta\beta_j  (R_j d_SD / w_j^2)  q_j(u(x), v(x)),
+    q_j  = p_u \sum_n h_n  c m_j p_j(u - n, v),   c = d_SD / sqrt(d_SD^2 + ((u - u_0) p_u)^2 + ((v - v_0) p_v)^2),
 
-h the band-limited ramp: h_0 = 1 / (4 p_u^2), h_n = -1 / (pi n p_u)^2 for odd n and 0 for even n (Kak and Slaney,
-Principles of Computerized Tomographic Imaging, eq. 3.61).  Its transfer is |k_u|.
+m the share of a line's measurements that the pixel gets, 1/2 over a full turn (redundancy.py), and h the band-limited
+ramp: h_0 = 1 / (4 p_u^2), h_n = -1 / (pi n p_u)^2 for odd n and 0 for even n (Kak and Slaney, Principles of
+Computerized Tomographic Imaging, eq. 3.61).  Its transfer is |k_u|.
 
 Where the source rises and falls on its way a(beta), rows are not the right direction.  A view knows the object's
 Fourier components k in the plane of its panel.  Each k is known wherever the path crosses the plane through its centre
@@ -29,7 +30,8 @@ import numpy as np
 import scipy.fft
 
 from tomopose.geometry.projection import ProjectionMatrices
-from tomopose.reconstruction.path import SourcePath
+from tomopose.reconstruction.fdk.path import SourcePath
+from tomopose.reconstruction.fdk.redundancy import Redundancy
 from tomopose.units import Array
 
 DIRECTIONS = 180
@@ -85,19 +87,24 @@ def panel_frequencies(
 class FdkFilter:
     """Weights and filters single views, ready for back-projection with weight "inverse-square"."""
 
-    def __init__(self, matrices: ProjectionMatrices, path: SourcePath, *, threads: int = 1) -> None:
+    def __init__(
+        self, matrices: ProjectionMatrices, path: SourcePath, *, redundancy: Redundancy | None = None, threads: int = 1
+    ) -> None:
         self._rays = matrices.decompose()
         self._path, self._threads = path, threads
+        self._redundancy = None if redundancy is None or redundancy.constant else redundancy
         self._p = matrices.p_u, matrices.p_v
         self._n = matrices.n_u, matrices.n_v
-        self._ramp = ramp_filter(matrices.n_u, matrices.p_u)
+        self.beyond = (0, 0) if self._redundancy is None else self._redundancy.beyond
+        self._ramp = ramp_filter(matrices.n_u + sum(self.beyond), matrices.p_u)
         self._rows_only = path.circular or not path.smooth
         if not self._rows_only:
             axes = np.stack([self._rays.U, self._rays.V], axis=1)
             axes /= np.linalg.norm(axes, axis=2, keepdims=True)
             self._crossings = crossings(path, axes)
             self._t = np.einsum("jab,jb->ja", axes, path.tangent) / path.distance[:, None]
-            self._panel = panel_frequencies(self._n, self._p, self._ramp.length, self._t)
+            wide = self._n[0] + sum(self.beyond), self._n[1]
+            self._panel = panel_frequencies(wide, self._p, self._ramp.length, self._t)
             # The band-limited ramp differs from k near 0, where it keeps a wide object's level.
             self._beyond_k = np.append(self._ramp.transfer - self._panel[0], np.float32(0))
 
@@ -125,9 +132,15 @@ class FdkFilter:
         return np.asarray(scipy.fft.irfft2(spectrum, s=size, workers=self._threads))
 
     def __call__(self, image: np.ndarray, j: int) -> np.ndarray:
-        """The line integrals (n_v, n_u) of view j, weighted and filtered, times the view's share of the sum."""
+        """The line integrals (n_v, n_u) of view j, weighted and filtered, times the view's share of the sum.
+
+        Returns (n_v, n_u + sum(beyond)): wider than the panel where the weights say so.
+        """
         n_u, n_v = self._n
-        weighted = (image * self.cosine(j)).astype(np.float32)
-        filtered = (self.along_rows(weighted) if self._rows_only else self.along_path(weighted, j))[:n_v, :n_u]
-        share = 0.5 * self._path.weight[j] * self._path.distance[j] * self._rays.d_SD[j]
-        return np.asarray(filtered * np.float32(share), dtype=np.float32)
+        below, above = self.beyond
+        share = 0.5 if self._redundancy is None else self._redundancy.weights(j)
+        weighted = np.zeros((n_v, n_u + below + above), dtype=np.float32)
+        weighted[:, below : below + n_u] = image * (self.cosine(j) * share)
+        filtered = self.along_rows(weighted) if self._rows_only else self.along_path(weighted, j)
+        scale = self._path.weight[j] * self._path.distance[j] * self._rays.d_SD[j]
+        return np.asarray(filtered[:n_v, : weighted.shape[1]] * np.float32(scale), dtype=np.float32)
