@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from reconstruction_phantom import balls, compare, images_of, line_integrals, sc
 
 from tomopose.engines import make_engine  # noqa: E402
 from tomopose.engines.rtk import RtkEngine, load_itk, rtk_geometry  # noqa: E402
-from tomopose.reconstruction import PAPER, reconstruct  # noqa: E402
+from tomopose.reconstruction import FDK, PAPER, SART, Execution, reconstruct  # noqa: E402
 from tomopose.reconstruction.order import view_order  # noqa: E402
 from tomopose.volume import VoxelGrid  # noqa: E402
 
@@ -138,12 +139,12 @@ def accuracy(views: int = 360, n: int = 256) -> Result:
     matrices = scan(grid, n=views, n_u=n * 400 // 256)
     images = images_of(matrices, objects)
     result: Result = {}
-    settings = {"default": {}, "paper": PAPER, "FDK preview": {"algorithm": "fdk-preview"}}
+    settings = {"default (fdk)": None, "paper": PAPER, "fdk+sart": SART(start=FDK()), "sart, golden order": SART()}
     for name, chosen in settings.items():
         clock = Clock()
         volume = clock(
             lambda c=chosen: reconstruct(
-                images, matrices, grid, images_are="line-integrals", consistency="off", engine="cpu", **c
+                images, matrices, grid, images_are="line-integrals", consistency="off", engine="cpu", algorithm=c
             )
         )
         found = compare(volume.values, grid, objects)
@@ -186,7 +187,7 @@ def agreement(n: int = 256, views: int = 90) -> Result:
             images_are="line-integrals",
             consistency="off",
             engine="cpu",
-            **{**PAPER, "order": order},
+            algorithm=replace(PAPER, order=order),
         ).values
         engine = RtkEngine(matrices, grid)
         state = engine.empty()
@@ -229,10 +230,13 @@ def slabs(n: int = 96) -> Result:
     grid = VoxelGrid.cube(n=n, spacing=0.1)
     matrices = scan(grid, n=40, n_u=150)
     images = images_of(matrices, balls(grid))
-    settings: Result = {"images_are": "line-integrals", "consistency": "off", "subset_size": 5, "engine": "cpu"}
+    settings: Result = {"images_are": "line-integrals", "consistency": "off", "engine": "cpu"}
+    settings["algorithm"] = SART(start=FDK(), subset_size=5)
     whole = reconstruct(images, matrices, grid, **settings).values
     with tempfile.TemporaryDirectory() as folder:
-        cut = np.array(reconstruct(images, matrices, grid, **settings, slabs=4, scratch=folder).values)
+        cut = np.array(
+            reconstruct(images, matrices, grid, **settings, execution=Execution(slabs=4, scratch=folder)).values
+        )
     result = {"largest_difference_over_range": float(np.abs(cut - whole).max() / np.ptp(whole))}
     print(f"slabs against one piece: {result}", flush=True)
     return result
@@ -248,7 +252,7 @@ def large(views: int = 20) -> Result:
     clock = Clock()
     volume = clock(
         lambda: reconstruct(
-            images, matrices, grid, images_are="line-integrals", consistency="off", engine="cpu", **PAPER
+            images, matrices, grid, images_are="line-integrals", consistency="off", engine="cpu", algorithm=PAPER
         )
     )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

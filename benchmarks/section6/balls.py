@@ -9,13 +9,12 @@ the tilt's seven periods, by latitude.
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
 
 from tomopose.measurement.measure import measure
 from tomopose.measurement.probing import sphere_pattern
-from tomopose.reconstruction import PAPER, reconstruct
+from tomopose.reconstruction import FDK, PAPER, SART, Correction, reconstruct
 from tomopose.simulation.objects.sphere_standard import sphere_centres, sphere_diameters
 from tomopose.studies.parts.result import DEFAULT_SEED
 from tomopose.studies.section6.blur import blur_of
@@ -35,10 +34,10 @@ NUMBERS = Numbers(
 LATITUDES = ((50, 70), (70, 90), (90, 110), (110, 130))
 """Degrees from the top."""
 PATHS: tuple[Path, ...] = ("circular", "3D")
-METHODS: dict[str, dict[str, Any]] = {
+METHODS: dict[str, FDK | SART] = {
     "one sweep of SART": PAPER,
-    "FDK, then SART": {},
-    "FDK along the path": {"algorithm": "fdk"},
+    "FDK, then SART": SART(start=FDK()),
+    "FDK along the path": FDK(),
 }
 
 
@@ -67,16 +66,16 @@ def main() -> None:
     for path in PATHS:
         scan = scan_with("standard", path, NUMBERS, DEFAULT_SEED)
         images = Radiographs(scan)
-        for name, options in METHODS.items():
+        for name, algorithm in METHODS.items():
             begin = time.process_time()
             volume = reconstruct(
                 images,
                 scan.truth,
                 grid_of("standard", NUMBERS),
-                white=WHITE,
+                correction=Correction(images_are="counts", white=WHITE),
+                algorithm=algorithm,
                 engine="cpu",
                 consistency="off",
-                **options,
             )
             seconds = time.process_time() - begin
             m = measure_standard(volume)

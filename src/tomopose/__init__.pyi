@@ -114,7 +114,14 @@ from .planning.design import plan_poses as plan_poses
 from .planning.limits import PlanLimits as PlanLimits
 from .planning.resolve import Resolvability as Resolvability
 from .provenance import Provenance as Provenance
+from .reconstruction.line_integrals import Correction as Correction
 from .reconstruction.run import reconstruct as reconstruct
+from .reconstruction.settings import CGLS as CGLS
+from .reconstruction.settings import FDK as FDK
+from .reconstruction.settings import OSSART as OSSART
+from .reconstruction.settings import SART as SART
+from .reconstruction.settings import EarlierOptions as EarlierOptions
+from .reconstruction.settings import Execution as Execution
 from .simulation.detector.detector import Detector as Detector
 from .simulation.detector.scatter_glare_mtf import MTF as MTF
 from .simulation.detector.scatter_glare_mtf import Glare as Glare

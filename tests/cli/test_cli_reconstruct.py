@@ -160,3 +160,75 @@ def test_beam_hardening_of_a_known_material_is_taken_out(scan, capsys):
     assert abs(flat - 1) < 0.4 * abs(cupped - 1)
     assert run(words(scan, "--images-are", "transmission", "--force", "--material", "Al")) == 2
     assert "--scene" in capsys.readouterr().err
+
+
+def test_voxels_may_have_three_sides(scan, capsys):
+    more = ["--voxel-mm", "0.6,0.6,0.9", "--size", "45,45,30", "--images-are", "transmission", "--json"]
+    given = ["reconstruct", "--matrices", scan / "matrices.npz", "--images", scan / "scan", "--out", scan / "volume.h5"]
+    assert run([*map(str, given), *more]) == 0
+    assert json.loads(capsys.readouterr().out)["voxel_mm"] == [0.6, 0.6, 0.9]
+    volume = tp.read_volume(scan / "volume.h5")
+    assert_allclose(volume.grid.spacing, [0.6, 0.6, 0.9])
+    assert_allclose(
+        volume.grid.points(np.argwhere(volume.values > MU / 2).astype(float)).mean(axis=0), CENTRE, atol=0.1
+    )
+    assert run([*map(str, given), "--size", "45", "--voxel-mm", "0.6,0.6", "--images-are", "transmission"]) == 2
+    assert "--voxel-mm" in capsys.readouterr().err
+
+
+def test_the_algorithm_chosen_is_said_and_kept(scan, capsys):
+    assert run(words(scan, "--images-are", "transmission")) == 0
+    choice = "fdk: the source makes a smooth full turn of 48 views"
+    assert f"note: {choice}" in capsys.readouterr().out
+    volume = tp.read_volume(scan / "volume.h5")
+    assert volume.provenance.arguments["choice"] == choice
+    assert choice in (scan / "volume.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("more", "option"),
+    [
+        (["--paper", "--relaxation", "0.5"], "--relaxation"),
+        (["--paper", "--iterations", "2"], "--iterations"),
+        (["--paper", "--order", "golden"], "--order"),
+        (["--paper", "--algorithm", "fdk"], "--algorithm"),
+        (["--paper", "--nonnegative"], "--nonnegative"),
+        (["--algorithm", "fdk", "--iterations", "2"], "--iterations"),
+    ],
+)
+def test_options_that_contradict_one_another_are_usage_errors(scan, more, option, capsys):
+    assert run(words(scan, "--images-are", "transmission", *more)) == 2
+    assert option in capsys.readouterr().err
+    assert not (scan / "volume.h5").exists()
+
+
+def test_the_paper_may_be_said_twice(scan, capsys):
+    more = ["--paper", "--relaxation", "0.8", "--algorithm", "sart", "--seed", "3", "--json"]
+    assert run(words(scan, "--images-are", "transmission", *more)) == 0
+    settings = json.loads(capsys.readouterr().out)["settings"]
+    assert (settings["algorithm"], settings["order"], settings["seed"]) == ("sart", "random", 3)
+
+
+def test_a_volume_that_contradicts_its_views_ends_with_3_and_names_them(scan, capsys):
+    images = sorted((scan / "scan").iterdir())
+    stack = [tp.open_images(path)[0].copy() for path in images]
+    for path, k in zip(images, np.random.default_rng(1).permutation(len(images)), strict=True):
+        tp.write_tiff(path, stack[k], force=True)
+    assert run(words(scan, "--images-are", "transmission")) == 3
+    said = capsys.readouterr().out
+    assert "not trustworthy: the volume contradicts" in said
+    assert "(pose " in said
+    assert not tp.read_volume(scan / "volume.h5").trustworthy
+
+
+def test_a_checkpoint_of_other_images_starts_anew_in_words(scan, capsys):
+    state = scan / "state"
+    more = ["--images-are", "transmission", "--checkpoint", str(state), "--force"]
+    assert run(words(scan, *more)) == 0
+    expected = tp.read_volume(scan / "volume.h5").values.copy()
+    state.mkdir(exist_ok=True)
+    (state / "state.json").write_text("{}", encoding="utf-8")
+    capsys.readouterr()
+    assert run(words(scan, *more)) == 0
+    assert "starts anew" in capsys.readouterr().err
+    assert np.array_equal(tp.read_volume(scan / "volume.h5").values, expected)

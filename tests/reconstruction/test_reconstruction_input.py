@@ -9,7 +9,8 @@ import pytest
 from reconstruction_phantom import balls, images_of, scan
 
 from tomopose.errors import ConventionError, InputError, OutOfViewError
-from tomopose.reconstruction import Correction, LineIntegrals, check_consistency, reconstruct, ring_offset
+from tomopose.reconstruction import Correction, Execution, LineIntegrals, check_consistency, reconstruct, ring_offset
+from tomopose.reconstruction.settings import OF_ALGORITHM, OF_CORRECTION, algorithm_of, with_options
 from tomopose.volume import VoxelGrid
 
 GRID = VoxelGrid.cube(n=40, spacing=0.15)
@@ -19,7 +20,22 @@ IMAGES.setflags(write=False)
 
 
 def attempt(images=IMAGES, matrices=MATRICES, grid=GRID, **settings):
-    return reconstruct(images, matrices, grid, **{"images_are": "line-integrals", **settings})
+    """settings: of `reconstruct`, or those that belong to an algorithm, `Correction` or `Execution`."""
+    known = ("images_are", "algorithm", "engine", "consistency", "mask")
+    options = {name: settings.pop(name) for name in list(settings) if name not in known}
+    algorithm = algorithm_of(settings.pop("algorithm", None))
+    images_are = settings.pop("images_are", "line-integrals")
+    given = {name: options.pop(name) for name in OF_CORRECTION if name in options}
+    swept = {name: options.pop(name) for name in OF_ALGORITHM if name in options}
+    return reconstruct(
+        images,
+        matrices,
+        grid,
+        algorithm=with_options(algorithm, swept),
+        correction=Correction(images_are=images_are, **given),
+        execution=Execution(**options),
+        **settings,
+    )
 
 
 @pytest.mark.parametrize(

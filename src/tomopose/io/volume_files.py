@@ -86,6 +86,7 @@ def _write_hdf5(volume: Volume, path: Path) -> None:
     with atomic_file(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs["schema"] = SCHEMA
         file.attrs["notes"] = json.dumps(list(volume.notes), ensure_ascii=False)
+        file.attrs["contradicted_views"] = np.array(volume.contradicted, dtype=np.int64)
         file.attrs["settings"] = json.dumps(plain(volume.settings), ensure_ascii=False)
         if volume.provenance is not None:
             file.attrs["provenance"] = json.dumps(plain(volume.provenance.to_json()), ensure_ascii=False)
@@ -121,6 +122,7 @@ def _read_hdf5(path: Path) -> Volume:
             for key in ("notes", "settings", "provenance")
             if key in file.attrs
         }
+        contradicted = tuple(file.attrs.get("contradicted_views", ()))
     block = said.get("provenance")
     return Volume(
         values=mapped(path),
@@ -128,6 +130,7 @@ def _read_hdf5(path: Path) -> Volume:
         view_residual=residual,
         notes=tuple(said["notes"]),
         settings=said["settings"],
+        contradicted=contradicted,
         provenance=None if block is None else Provenance.from_json(block),
     )
 

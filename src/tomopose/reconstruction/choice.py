@@ -117,7 +117,6 @@ def fdk_obstacle(s: Situation) -> str:
     """Why FDK is not defined here, in words; empty where it is."""
     if s.path is None or s.fan is None:
         return f"{s.n} views do not determine a path of the source"
-    covered = math.degrees(s.path.coverage)
     if s.n < FEWEST_FOR_FDK * s.path.coverage / (2 * math.pi):
         return f"{s.n} views are too few: below {FEWEST_FOR_FDK} a turn its sum over the views is no integral any more"
     if not s.path.smooth:
@@ -134,14 +133,20 @@ def fdk_obstacle(s: Situation) -> str:
         )
     if s.path.full_turn:
         return ""
-    if len(s.path.holes) > 1:
-        return f"the turn has {len(s.path.holes)} stretches without views, {360 - covered:.0f} degrees together"
-    if not s.path.circular:
+    return short_scan_obstacle(s, s.path)
+
+
+def short_scan_obstacle(s: Situation, path: SourcePath) -> str:
+    """Why FDK is not defined on a path with holes, in words; empty where it is."""
+    covered = math.degrees(path.coverage)
+    if len(path.holes) > 1:
+        return f"the turn has {len(path.holes)} stretches without views, {360 - covered:.0f} degrees together"
+    if not path.circular:
         return (
             f"the source covers {covered:.0f} of 360 degrees and leaves the plane of its path: weights for a short "
             "scan are defined on a circle"
         )
-    if lines_missing(s.path, s.needed):
+    if lines_missing(path, s.needed):
         return (
             f"the source covers {covered:.0f} degrees, and every line through the grid is measured from "
             f"{180 + 2 * math.degrees(s.needed):.0f} on"

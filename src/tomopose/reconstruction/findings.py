@@ -16,9 +16,9 @@ from tomopose.reconstruction.field import every_nth_pixel
 from tomopose.units import Array
 from tomopose.volume import VoxelGrid
 
-ABSURD = 0.5
-"""Share of a view's signal that a volume may leave unexplained.  Scans of 16 to 120 views leave 0.02 to 0.28 (see
-`FEWEST_FOR_FDK`), images of another object or in another order 0.7 to 2."""
+ABSURD = 0.3
+"""Share of a view's signal (rms) that a volume may leave unexplained.  Scans of 16 to 120 views leave 0.02 to 0.28 (see
+`FEWEST_FOR_FDK`); images of another object, in another order, 0.3 to 0.6."""
 NOTHING = 1.0
 """The share that an empty volume leaves: the limit where the grid does not hold the object."""
 OUTSIDE = 0.05

@@ -26,7 +26,15 @@ from tomopose.reconstruction.line_integrals import (
     require_contrast,
     ring_offset,
 )
-from tomopose.reconstruction.settings import SART, Algorithm, Earlier, Execution, algorithm_of, described, with_earlier
+from tomopose.reconstruction.settings import (
+    SART,
+    Algorithm,
+    EarlierOptions,
+    Execution,
+    algorithm_of,
+    described,
+    with_earlier,
+)
 from tomopose.reconstruction.work import Work, solve
 from tomopose.volume import Volume, VoxelGrid
 
@@ -46,7 +54,7 @@ def reconstruct(
     mask: npt.NDArray[np.bool_] | None = None,
     consistency: Literal["error", "off"] = "error",
     progress: Callable[[int, int], None] | None = None,
-    **earlier: Unpack[Earlier],
+    **earlier: Unpack[EarlierOptions],
 ) -> Volume:
     """Reconstruct a scan along any path from its projection matrices.
 
@@ -55,8 +63,8 @@ def reconstruct(
     images:     n images [v, u] in any lazy sequence with a length; array row index = v (row 0 is the bottom).
     matrices:   n projection matrices of eq. (5).
     grid:       where the voxels lie in W.
-    images_are: "transmission", "line-integrals" or "counts"; may be left out where the sequence or `correction` says it.
-                It is never guessed.
+    images_are: "transmission", "line-integrals" or "counts"; may be left out where the sequence or `correction` says
+                it.  It is never guessed.
     algorithm:  a value, SART(iterations=2), OSSART(), FDK(), CGLS(), `PAPER`, or its short name: "sart", "ossart",
                 "fdk", "fdk+sart", "cgls", "fdk-preview".  None or "auto": FDK on smooth full turns of enough views,
                 else SART, which begins with FDK where that is defined.  The choice and its reason are in the notes.
@@ -104,6 +112,7 @@ def reconstruct(
         "engine": probe.name,
         "mask": support is not None,
         **scan.correction.described,
+        "choice": choice.words,
     }
     notes = [choice.words, *scan_notes(situation, matrices, grid)]
     if consistency == "error":

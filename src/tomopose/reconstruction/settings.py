@@ -10,16 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal, TypedDict
+from typing import Literal, TypedDict
 
 import numpy as np
 import numpy.typing as npt
 
 from tomopose.errors import InputError
 from tomopose.reconstruction.line_integrals import Correction
-
-if TYPE_CHECKING:
-    from distributed import Client
 
 Order = str | tuple[int, ...]
 """Of the views: "golden", "random" (from a seed), "sequential", or a permutation of their indices; see `view_order`."""
@@ -140,7 +137,7 @@ class Execution:
     scratch: str | Path | None = None
     checkpoint: str | Path | None = None
     checkpoint_seconds: float = 60.0
-    client: Client | None = None
+    client: object | None = None
     slabs: int | None = None
     engine_options: Mapping[str, object] = field(default_factory=dict)
 
@@ -211,7 +208,7 @@ def described(algorithm: Algorithm) -> dict[str, object]:
 Level = float | npt.NDArray[np.generic]
 
 
-class Earlier(TypedDict, total=False):
+class EarlierOptions(TypedDict, total=False):
     """The options of `reconstruct` in tomopose 0.1 that belong to `Correction`, an algorithm or `Execution` now."""
 
     white: Level
@@ -230,7 +227,7 @@ class Earlier(TypedDict, total=False):
     scratch: str | Path | None
     checkpoint: str | Path | None
     checkpoint_seconds: float
-    client: Client | None
+    client: object | None
     slabs: int | None
     engine_options: Mapping[str, object] | None
 
@@ -249,7 +246,7 @@ def with_earlier(
 
     Raises TypeError for an option that never was, InputError where one contradicts a value that is given too.
     """
-    unknown = [name for name in earlier if name not in Earlier.__annotations__]
+    unknown = [name for name in earlier if name not in EarlierOptions.__annotations__]
     if unknown:
         raise TypeError(f"reconstruct() got an unexpected keyword argument {unknown[0]!r}")
     if earlier:

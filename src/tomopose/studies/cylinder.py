@@ -19,6 +19,7 @@ from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.reconstruction.run import reconstruct
+from tomopose.reconstruction.settings import FDK, SART, Algorithm
 from tomopose.report.page import Figure
 from tomopose.report.style import ACCENT, ALERT, ORANGE, axis, layout
 from tomopose.studies.parts.result import Progress, Scale, StudyCheck, StudyRow, check_below
@@ -37,8 +38,7 @@ PERIODS = 7
 ANGLES = 252
 PLAN = {"small": (8, 126), "paper": (4, 504)}
 """Scale -> detector binning, views."""
-FILTERED, SWEPT = {"algorithm": "fdk"}, {"algorithm": "sart"}
-GOLDEN, SEQUENTIAL = {"order": "golden"}, {"order": "sequential"}
+FILTERED, GOLDEN, SEQUENTIAL = FDK(), SART(order="golden"), SART(order="sequential")
 
 TITLE = "Fig. 12 in principle: a cylinder's surface"
 QUESTION = "Do the manipulator's errors print the tilt's seven periods on a surface, and are they gone by our best?"
@@ -120,7 +120,7 @@ def periodic_part(deviation: Array) -> float:
     return float(2 * np.abs(np.fft.rfft(deviation)[PERIODS]) / len(deviation))
 
 
-def cases_of(scale: Scale, seed: int) -> tuple[dict[str, tuple[Any, Any, dict[str, Any]]], Scanner]:
+def cases_of(scale: Scale, seed: int) -> tuple[dict[str, tuple[Any, Any, Algorithm]], Scanner]:
     """Name -> (true matrices, those used, how it is reconstructed), and the binned scanner."""
     binning, views = PLAN[scale]
     run = ball_run(MAGNIFICATION, 3, seed, number=1)
@@ -140,10 +140,10 @@ def cases_of(scale: Scale, seed: int) -> tuple[dict[str, tuple[Any, Any, dict[st
     tilted, round_ = true(scan, real_T_MH(scan, MAGNIFICATION)), true(circle, circle.T_MH)
     return {
         "circular scan": (round_, round_, FILTERED),
-        "3D scan, paper's method": (tilted, projection_matrices(paper, scan, binning=binning), SWEPT | GOLDEN),
+        "3D scan, paper's method": (tilted, projection_matrices(paper, scan, binning=binning), GOLDEN),
         "3D scan, our best": (tilted, projection_matrices(best, scan, binning=binning), FILTERED),
         "3D scan, true matrices": (tilted, tilted, FILTERED),
-        "circular scan, sequential order": (round_, round_, SWEPT | SEQUENTIAL),
+        "circular scan, sequential order": (round_, round_, SEQUENTIAL),
     }, fine.binned(binning)
 
 
@@ -157,10 +157,10 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
     for k, (name, (P_true, P_used, how)) in enumerate(cases.items()):
 
         def surface(
-            P_true: ProjectionMatrices = P_true, P_used: ProjectionMatrices = P_used, how: dict[str, Any] = how
+            P_true: ProjectionMatrices = P_true, P_used: ProjectionMatrices = P_used, how: Algorithm = how
         ) -> dict[str, Any]:
             images = [cylinder_integrals(P, scanner).astype(np.float32) for P in P_true.P]
-            volume = reconstruct(images, P_used, grid, images_are="line-integrals", engine="cpu", **how)
+            volume = reconstruct(images, P_used, grid, images_are="line-integrals", engine="cpu", algorithm=how)
             return {"deviation": surface_deviation(volume)}
 
         found[name] = np.array(steps.of(f"surface-{k}", surface)["deviation"])

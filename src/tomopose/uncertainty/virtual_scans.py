@@ -34,6 +34,7 @@ from tomopose.measurement.measure import measure
 from tomopose.measurement.plan import MeasurementPlan
 from tomopose.measurement.result import MeasurementResult
 from tomopose.measurement.uncertainty import Simulated, shortest_interval
+from tomopose.reconstruction.line_integrals import Correction
 from tomopose.reconstruction.run import reconstruct
 from tomopose.simulation.detector.detector import expose, reference_images
 from tomopose.simulation.run import SimulatedRun, signal
@@ -118,9 +119,8 @@ def virtual_volumes(
         box = replace(grid, centre=grid.centre / size - shift, spacing=grid.spacing / size)
         images = [expose(signal(placed, i), run.detector, run.scanner, seed=noise, frame=i) for i in range(len(run))]
         white, dark = _levels(run, noise)
-        yield reconstruct(
-            images, matrices, box, images_are="counts", white=white, dark=dark, consistency="off", **dict(options or {})
-        )
+        levels = Correction(images_are="counts", white=white, dark=dark)
+        yield reconstruct(images, matrices, box, correction=levels, consistency="off", **dict(options or {}))
 
 
 def _placed(run: SimulatedRun, size: float, shift: Array) -> SimulatedRun:

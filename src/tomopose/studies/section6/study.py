@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
-from tomopose.reconstruction.run import PAPER
+from tomopose.reconstruction.settings import FDK, PAPER, Algorithm
 from tomopose.studies.parts.result import Progress, Scale
 from tomopose.studies.parts.steps import Steps
 from tomopose.studies.parts.virtual_hexapod import ball_run, scan_error_um
@@ -90,11 +91,11 @@ def is_compared(case: Case) -> bool:
     return case.run > 0 and not case.order
 
 
-def options_of(case: Case) -> dict[str, Any]:
+def algorithm_of(case: Case) -> Algorithm:
     """How a volume is reconstructed: as the paper does, or by our best, the ramp filter along the source's path."""
     if case.method == "paper" or case.order:
-        return {**PAPER, **({"order": case.order} if case.order else {})}
-    return {"algorithm": "fdk"}
+        return replace(PAPER, order=case.order) if case.order else PAPER
+    return FDK()
 
 
 def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any, Any, Any, Any]:
@@ -146,7 +147,7 @@ def run_with(
                 images[case.path],
                 lambda c=case, s=scan, d=solved: matrices_for(c, s, d),  # type: ignore[misc]
                 numbers,
-                options_of(case),
+                algorithm_of(case),
                 steps,
                 part,
             )

@@ -12,7 +12,9 @@ import numpy as np
 from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.calibration.result import Calibration
 from tomopose.geometry.projection import ProjectionMatrices
+from tomopose.reconstruction.line_integrals import Correction
 from tomopose.reconstruction.run import reconstruct
+from tomopose.reconstruction.settings import FDK, Algorithm, Execution, described
 from tomopose.simulation.objects.sphere_standard import SHAFT_DIAMETER, sphere_centres, sphere_diameters
 from tomopose.studies.parts.result import Progress
 from tomopose.studies.parts.steps import Steps
@@ -81,29 +83,28 @@ def volume_for(
     images: Radiographs,
     matrices: ProjectionMatrices,
     numbers: Numbers,
-    options: Mapping[str, Any],
+    algorithm: Algorithm,
     checkpoint: FilePath | None,
     progress: Progress | None,
 ) -> Volume:
-    """Reconstructed with the options of `reconstruct`; a kept state lets an interrupted one go on.
+    """Reconstructed by an algorithm; a kept state lets an interrupted one go on.
 
     FDK finds each voxel by itself, so that those far from the object need not be found.
     """
     grid = grid_of(case.thing, numbers)
-    mask = near(case.thing, grid, numbers.edge) if options.get("algorithm") == "fdk" else None
+    mask = near(case.thing, grid, numbers.edge) if isinstance(algorithm, FDK) else None
     # The matrices belong to the images by construction, so that other readings need not be tried.
     return reconstruct(
         images,
         matrices,
         grid,
-        white=WHITE,
+        correction=Correction(images_are="counts", white=WHITE),
+        algorithm=algorithm,
         engine="cpu",
+        execution=Execution(checkpoint=checkpoint, checkpoint_seconds=CHECKPOINT_SECONDS),
         consistency="off",
         mask=mask,
-        checkpoint=checkpoint,
-        checkpoint_seconds=CHECKPOINT_SECONDS,
         progress=progress,
-        **options,
     )
 
 
@@ -136,7 +137,7 @@ def measured(
     images: Radiographs,
     matrices: Callable[[], ProjectionMatrices],
     numbers: Numbers,
-    options: Mapping[str, Any],
+    algorithm: Algorithm,
     steps: Steps,
     progress: Progress,
 ) -> dict[str, Any]:
@@ -144,7 +145,7 @@ def measured(
 
     def compute() -> dict[str, Any]:
         checkpoint = None if steps.folder is None else steps.folder / f"state-{case.name}"
-        volume = volume_for(case, scan, images, matrices(), numbers, options, checkpoint, progress)
+        volume = volume_for(case, scan, images, matrices(), numbers, algorithm, checkpoint, progress)
         residual = volume.view_residual
         found = measure_specimen(volume, numbers.edge) if case.thing == "specimen" else measure_standard(volume)
         return {**found, "residual": None if residual is None else float(np.median(residual))}
@@ -152,6 +153,6 @@ def measured(
     return steps.of(
         f"volume-{case.name}",
         compute,
-        options=dict(options),
+        options=described(algorithm),
         numbers={k: v[case.thing] if isinstance(v, Mapping) else v for k, v in asdict(numbers).items() if k != "runs"},
     )
