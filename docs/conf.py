@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from pathlib import Path
 
@@ -18,7 +19,9 @@ myst_heading_anchors = 3
 root_doc = "index"
 exclude_patterns = ["_build", "changelog.d", "**/README.md"]
 autodoc_member_order = "bysource"
-autodoc_typehints = "none"  # the docstrings give shapes, units and frames
+autodoc_typehints = "signature"  # the docstrings give shapes, units and frames
+autodoc_typehints_format = "short"
+python_maximum_signature_line_length = 88
 add_module_names = False
 
 html_theme = "furo"
@@ -30,20 +33,56 @@ FOLDER = Path(__file__).parent
 SPECIAL = re.compile(r"([\\*_`|<>])")
 
 
+GROUPS = {
+    "geometry": ("Frames, transforms, scanner, matrices", ("geometry",)),
+    "poses": ("Poses and manipulators", ("manipulator", "trajectory")),
+    "images": ("Radiographs", ("io.images", "io.pairing")),
+    "files": ("Tables and files", ("io", "observations", "provenance", "errors")),
+    "detection": ("Find the ball", ("detection",)),
+    "calibration": ("Calibrate, judge and compare", ("calibration",)),
+    "exports": ("Geometry for other packages", ("exports",)),
+    "planning": ("Plan poses and scans", ("planning",)),
+    "reconstruction": ("Reconstruct", ("reconstruction", "engines", "volume")),
+    "measurement": ("Measure", ("measurement", "uncertainty")),
+    "simulation": ("Simulate", ("simulation",)),
+}
+"""Page of the reference -> its title (a task) and the rooms whose public names it lists; the first that fits counts."""
+
+
+def group_of(module: str) -> str:
+    """The page on which the names of a module are listed."""
+    room = module.removeprefix("tomopose.")
+    fits = [(len(r), page) for page, (_, rooms) in GROUPS.items() for r in rooms if (room + ".").startswith(r + ".")]
+    if not fits:
+        raise ValueError(f"{module}: no page of the reference lists it; give its room to one of GROUPS")
+    return max(fits)[1]
+
+
 def write_reference(app: object) -> None:
-    """One page that documents every public name, so that a new one cannot be forgotten."""
-    lines = ["Python reference", "================", "", "Every public name of ``tomopose``, by alphabet.", ""]
+    """One page a task, with every public name on one of them, so that a new one cannot be forgotten."""
+    folder = FOLDER / "_generated"
+    folder.mkdir(exist_ok=True)
+    pages: dict[str, list[str]] = {page: [title, "=" * len(title), ""] for page, (title, _) in GROUPS.items()}
+    for page, lines in pages.items():
+        example = FOLDER.parent / "examples" / "reference" / f"{page}.py"
+        lines += [f".. literalinclude:: ../../examples/reference/{page}.py", "   :language: python", ""]
+        if not example.is_file():
+            raise FileNotFoundError(f"{example}: each page of the reference begins with an example that runs")
     for name in tomopose.__all__:
         value = getattr(tomopose, name)
-        kind = "class" if isinstance(value, type) else "function"
-        lines += [name, "-" * len(name), "", f".. auto{kind}:: tomopose.{name}"]
-        lines += ["   :members:"] if kind == "class" and not issubclass(value, Exception) else []
-        lines += ["   :no-index-entry:", ""]
-    target = FOLDER / "_generated" / "reference.rst"
-    target.parent.mkdir(exist_ok=True)
-    text = "\n".join(lines)
-    if not target.exists() or target.read_text(encoding="utf-8") != text:
-        target.write_text(text, encoding="utf-8")
+        if inspect.ismodule(value):
+            pages["files"] += [f".. automodule:: {value.__name__}", "   :members:", "   :no-index:", ""]
+            continue
+        kind = "class" if isinstance(value, type) else "function" if callable(value) else "data"
+        pages[group_of(value.__module__)] += [name, "-" * len(name), "", f".. auto{kind}:: tomopose.{name}"]
+        members = kind == "class" and not issubclass(value, Exception)
+        pages[group_of(value.__module__)] += ["   :members:", ""] if members else [""]
+    index = ["Python reference", "================", "", "Every public name of ``tomopose``, by task.", ""]
+    index += [".. toctree::", "", *(f"   reference_{page}" for page in GROUPS), ""]
+    for page, lines in {**{f"reference_{p}": lines for p, lines in pages.items()}, "reference": index}.items():
+        target, text = folder / f"{page}.rst", "\n".join(lines)
+        if not target.exists() or target.read_text(encoding="utf-8") != text:
+            target.write_text(text, encoding="utf-8")
 
 
 def keep_docstrings_as_written(
