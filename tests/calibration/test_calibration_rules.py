@@ -10,17 +10,8 @@ from typing import Any
 import pytest
 
 from tomopose.calibration.checks.convention_tests import Diagnosis, Hypothesis
-from tomopose.calibration.checks.rules import (
-    ARRANGEMENTS,
-    MODELS,
-    RULES,
-    AgainstRigid,
-    BallSize,
-    Evidence,
-    ScatterFound,
-    findings,
-    rules_table,
-)
+from tomopose.calibration.checks.evidence.evidence import AgainstRigid, BallSize, Evidence, ScatterFound
+from tomopose.calibration.checks.rules import ARRANGEMENTS, MODELS, RULES, findings, rules_table
 from tomopose.calibration.checks.stability import Effect, OutlierBlock, RepeatedPose, Stability
 from tomopose.calibration.checks.verdict import VERDICTS, Finding, judge
 
@@ -131,6 +122,7 @@ def met(name: str, e: Evidence) -> Mapping[str, Any]:
         "unexplained residuals": {"chi2_dof": 6.0, "chi2": 6.0 * 369, "residual_px": 0.0507},
         "residuals above the stated uncertainty": {"chi2": 1.5 * 369, "chi2_dof": 1.5, "widened": False},
         "residuals below the stated uncertainty": {"chi2_dof": 0.01},
+        "contradicted prior": {"prior_pulls": (("u_0", 0.5), ("v_0", -21.0))},
         "drift": moved(e, at=""),
         "step": moved(e, at="100"),
         "repeated pose": {"stability": repeat(e)},

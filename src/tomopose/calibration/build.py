@@ -9,7 +9,8 @@ import numpy as np
 
 from tomopose.calibration.checks.ball_size import chain_matrices, measured_ball_size, require_ball_size
 from tomopose.calibration.checks.convention_tests import Diagnosis
-from tomopose.calibration.checks.rules import AgainstRigid, BallSize, Evidence, ScatterFound, findings
+from tomopose.calibration.checks.evidence.evidence import AgainstRigid, BallSize, Evidence, ScatterFound
+from tomopose.calibration.checks.rules import findings
 from tomopose.calibration.checks.stability import stability
 from tomopose.calibration.model.covariance import angles_by_tangent
 from tomopose.calibration.model.linear_fit import LinearFit
@@ -172,6 +173,11 @@ def evidence_of(f: Fitted, result: Calibration) -> Evidence:
         run_effects=more.run_effects,
         open_turns=more.open_turns,
         ball_size=ball_size_of(f),
+        prior_pulls=tuple(
+            (name, float(d / s))
+            for name, d, s in zip(f.free.names, f.delta, f.free.sigma, strict=True)
+            if np.isfinite(s)
+        ),
     )
 
 

@@ -7,12 +7,13 @@ residuals as millimetres.  The ball's diameter is a length of its own, and its s
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Protocol
+
 import numpy as np
 
-from tomopose.calibration.checks.conventions import POSITION_UNITS
-from tomopose.calibration.checks.rules import BallSize
-from tomopose.calibration.model.problem import Problem, pair
-from tomopose.calibration.result import Calibration
+from tomopose.calibration.checks.evidence.evidence import BallSize
+from tomopose.calibration.model.problem import POSITION_UNITS, Problem, pair
 from tomopose.errors import InputError, UnitError
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
@@ -26,6 +27,19 @@ WRONG = 0.02
 UNIT_TOLERANCE = 0.05
 """A size that is off by the factor of a unit of length within this is off by that unit; the diameter may be wrong by a
 few per cent besides.  The nearest factors, 10 and 25.4, are far apart."""
+
+
+class Placed(Protocol):
+    """Where a calibration puts the balls."""
+
+    @property
+    def scanner(self) -> Scanner: ...
+    @property
+    def T_HT(self) -> RigidTransform: ...
+    @property
+    def balls(self) -> Mapping[int, Array]: ...
+    @property
+    def pose_id(self) -> tuple[str, ...]: ...
 
 
 def chain_matrices(problem: Problem, scanners: tuple[Scanner, ...], T_HT: RigidTransform) -> Array:
@@ -77,9 +91,7 @@ def measured_ball_size(problem: Problem, P: Array, centres: Array) -> BallSize |
     return BallSize(ratio=own, diameter=problem.ball_diameter, unit=unit)
 
 
-def size_ratio(
-    calibration: Calibration, poses: PoseSequence, observations: BallObservations, ball_diameter: float
-) -> float:
+def size_ratio(calibration: Placed, poses: PoseSequence, observations: BallObservations, ball_diameter: float) -> float:
     """Median over the poses used of the measured size of the silhouette over the calculated one; NaN without sizes.
 
     poses: those of the calibration's chain as commanded (inverse ones where the scanner moves).

@@ -14,14 +14,11 @@ import numpy as np
 
 from tomopose.calibration.checks.alternative import Alternative, Change
 from tomopose.calibration.checks.orientation_readings import POSES, orientation_alternatives
-from tomopose.calibration.model.problem import Problem, rotated
+from tomopose.calibration.model.problem import POSITION_UNITS, Problem, rotated
 
 TABLE_OFFSET = np.radians(5.0)
 ROWS = "scanner.json: the other value of image_rows"
 FEWEST_PAIRS = 5
-
-POSITION_UNITS = (("centimetres", "cm", 10.0), ("inches", "inch", 25.4), ("metres", "m", 1000.0))
-"""Units in which positions are written under columns that say mm: name, symbol, millimetres."""
 
 
 def _upside_down(p: Problem) -> Problem | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from tomopose.calibration.build import Fitted, ManipulatorEvidence, build, expected_px
 from tomopose.calibration.checks.convention_tests import Diagnosis
-from tomopose.calibration.checks.rules import AgainstRigid, ScatterFound
+from tomopose.calibration.checks.evidence.evidence import AgainstRigid, ScatterFound
 from tomopose.calibration.identified.fit import ModelFit
 from tomopose.calibration.identified.map_estimate import linear_fit, linearise, singular_values
 from tomopose.calibration.identified.model_selection import better, by_rotation

@@ -17,6 +17,8 @@ from tomopose.observations import BallObservations
 from tomopose.units import Array
 
 FEWEST_POSES = 5
+POSITION_UNITS = (("centimetres", "cm", 10.0), ("inches", "inch", 25.4), ("metres", "m", 1000.0))
+"""Units in which positions are written under columns that say mm: name, symbol, millimetres."""
 SAME_ROTATION_RAD = 1e-6
 """Ten digits of a file leave 2e-9 rad; corrected poses differ by more."""
 

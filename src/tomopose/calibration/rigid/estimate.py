@@ -7,11 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.checks.conventions import POSITION_UNITS
 from tomopose.calibration.model.covariance import inverse_information, significant, widening
 from tomopose.calibration.model.parameters import UNITS, FreeParameters, free_parameters
-from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.rigid.fit import Fit, blocks, jacobian, minimise, residuals, tangent_names, whitened2
+from tomopose.calibration.model.problem import POSITION_UNITS, Problem
+from tomopose.calibration.rigid.fit import (
+    Fit,
+    blocks,
+    jacobian,
+    linear_fit,
+    minimise,
+    residuals,
+    tangent_names,
+    whitened2,
+)
 from tomopose.calibration.rigid.observability import cure, unobservable_directions
 from tomopose.calibration.rigid.outliers import RobustFit, robust_fit
 from tomopose.calibration.rigid.pose_noise import PoseNoise, estimate_pose_noise, total_covariance
@@ -211,7 +219,15 @@ def with_pose_noise(solution: Solution, pose_noise: Any, *, robust: bool = True)
         used = original.select(solution.robust.keep)
         at = blocks(used, solution.free, solution.fit)
         if isinstance(pose_noise, str):
-            noise = estimate_pose_noise(used.covariance, at, jacobian(used, solution.free, at), used.x_D - at.x_D)
+            fit = linear_fit(used, solution.free, solution.fit)
+            noise = estimate_pose_noise(
+                used.covariance,
+                at,
+                fit.J,
+                fit.r,
+                prior_rows=fit.prior_rows,
+                prior_residuals=fit.prior_residuals,
+            )
         else:
             noise = PoseNoise(translation=float(pose_noise[0]), rotation=float(pose_noise[1]))
         if noise.translation == noise.rotation == 0.0:

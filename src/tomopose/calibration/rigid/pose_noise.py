@@ -22,6 +22,8 @@ from tomopose.units import Array
 
 WORTH_IT = 9.2
 """-2 log L must fall by this much (1 % of chi2 with 2 degrees of freedom) before pose noise is believed."""
+SINGULAR = 1e-14
+"""Least eigenvalue of the scaled information matrix over the largest: rounding of its entries."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,9 +51,14 @@ def total_covariance(covariance: Array, b: ProjectionBlocks, noise: PoseNoise) -
     return covariance + noise.translation**2 * A + noise.rotation**2 * B
 
 
-def estimate_pose_noise(covariance: Array, b: ProjectionBlocks, J: Array, r: Array) -> PoseNoise:
-    """The components that best explain residuals r (n, 2) px of a fit with Jacobian J (n, 2, m), priors as rows left
-    out.  Both are 0 where detection noise explains the residuals as well."""
+def estimate_pose_noise(
+    covariance: Array, b: ProjectionBlocks, J: Array, r: Array, *, prior_rows: Array, prior_residuals: Array
+) -> PoseNoise:
+    """The components that best explain residuals r (n, 2) px of a fit with Jacobian J (n, 2, m).
+
+    prior_rows (k, m), prior_residuals (k,): priors in standard deviations, whose information N needs where the poses
+    alone determine no freed parameter.  Both components are 0 where detection noise explains the residuals as well.
+    """
     A, B = pose_spread(b)
     d2 = float(np.mean((r**2).sum(axis=1)))
     # starts: each component alone explaining the whole of the residual
@@ -60,16 +67,18 @@ def estimate_pose_noise(covariance: Array, b: ProjectionBlocks, J: Array, r: Arr
         np.sqrt(d2 / max(np.mean(np.trace(B, axis1=1, axis2=2)), 1e-300)),
     )
     scale = 1.0 / np.maximum(np.linalg.norm(J, axis=(0, 1)), 1e-300)
-    Js = J * scale
+    Js, held = J * scale, prior_rows * scale
+    N_prior, g_prior = held.T @ held, held.T @ prior_residuals
 
     def objective(q: Array) -> float:
         V = covariance + (s_A * np.exp(q[0])) ** 2 * A + (s_B * np.exp(q[1])) ** 2 * B
         Vi = np.linalg.inv(V)
         ViJ = Vi @ Js
-        N = np.einsum("kia,kib->ab", Js, ViJ)
-        g = np.einsum("kia,ki->a", ViJ, r)
-        quadratic = np.einsum("ki,kij,kj->", r, Vi, r) - g @ np.linalg.solve(N, g)
-        return float(np.log(np.linalg.det(V)).sum() + np.linalg.slogdet(N)[1] + quadratic)
+        value, Q = np.linalg.eigh(np.einsum("kia,kib->ab", Js, ViJ) + N_prior)
+        value = np.maximum(value, SINGULAR * value[-1])
+        g = Q.T @ (np.einsum("kia,ki->a", ViJ, r) + g_prior)
+        quadratic = np.einsum("ki,kij,kj->", r, Vi, r) - g @ (g / value)
+        return float(np.log(np.linalg.det(V)).sum() + np.log(value).sum() + quadratic)
 
     none = objective(np.array([-40.0, -40.0]))
     best = min(
