@@ -29,6 +29,11 @@ from .detection.finder.find import Candidate as Candidate
 from .detection.image import detect_image as detect_image
 from .detection.result import BallImage as BallImage
 from .detection.run.detect import detect as detect
+from .engines.objects import to_astra as to_astra
+from .engines.objects import to_cil as to_cil
+from .engines.objects import to_leap as to_leap
+from .engines.objects import to_rtk as to_rtk
+from .engines.objects import to_tigre as to_tigre
 from .errors import TomoposeError as TomoposeError
 from .exports.folder import Exported as Exported
 from .exports.folder import export as export

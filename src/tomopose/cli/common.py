@@ -158,5 +158,9 @@ def names(text: str | None) -> tuple[str, ...]:
 
 
 def arguments(**values: Any) -> dict[str, Any]:
-    """The arguments of a verb for the provenance: paths by their names alone."""
-    return {k: v.name if isinstance(v, Path) else v for k, v in values.items() if v is not None}
+    """The arguments of a verb for the provenance: paths by their names alone, and the project's facts for reports."""
+    from tomopose.cli.project import current_facts
+
+    said = {k: v.name if isinstance(v, Path) else v for k, v in values.items() if v is not None}
+    facts = current_facts()
+    return {**said, "measurement": facts} if facts else said

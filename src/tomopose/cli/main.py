@@ -30,12 +30,14 @@ from tomopose.cli.common import (
     speak_any_terminal,
     tell,
 )
+from tomopose.cli.project import default_map, project_for, without_project
 from tomopose.errors import EngineMissingError, TomoposeError
 
 OF_THE_SYSTEM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EMFILE, errno.ENFILE})
 """Faults of disks and limits, which no command line causes."""
 
 VERBS = (
+    "init",
     "demo",
     "simulate",
     "detect",
@@ -83,6 +85,12 @@ def root(
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and stop.")
     ] = False,
+    project: Annotated[
+        str | None,
+        typer.Option(
+            "--project", help="Project file, before or after the verb; default: tomopose.toml of the working folder."
+        ),
+    ] = None,
 ) -> None:
     """Pose calibration for X-ray tomography: from radiographs of one ball to exact projection matrices."""
 
@@ -147,7 +155,10 @@ def _carried_out(words: list[str], *, as_json: bool) -> int:
         empty = _empty_option(words)
         if empty is not None:
             raise typer.BadParameter("the value is empty", param_hint=empty)
-        code = typer.main.get_command(app).main(args=words, prog_name="tomopose", standalone_mode=False)
+        words, named = without_project(words)
+        command, project = typer.main.get_command(app), project_for(words, named)
+        defaults = default_map(command, project, words)
+        code = command.main(args=words, prog_name="tomopose", standalone_mode=False, default_map=defaults, obj=project)
         return code if isinstance(code, int) else OK
     except CommandLineError as error:
         return _usage(error, as_json=as_json)

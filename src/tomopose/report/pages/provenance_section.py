@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from tomopose.provenance import Provenance
 from tomopose.report.page import Block, Section, Table, Words
 from tomopose.report.words import NOT_GIVEN, cell
+
+MEASUREMENT = "measurement"
+"""The argument that holds what a project file says for its reports."""
 
 
 def provenance_section(provenance: Provenance | None) -> Section:
@@ -18,9 +23,20 @@ def provenance_section(provenance: Provenance | None) -> Section:
         ["platform", provenance.platform or NOT_GIVEN],
         ["seed", seed],
         *[[name, version] for name, version in provenance.dependencies.items()],
-        *[[f"argument {name}", cell(value)] for name, value in provenance.arguments.items()],
+        *[[f"argument {name}", cell(value)] for name, value in provenance.arguments.items() if name != MEASUREMENT],
     ]
     blocks: list[Block] = [Table(title="Made by", meaning="", columns=["what", "value"], rows=facts)]
+    said = provenance.arguments.get(MEASUREMENT)
+    if isinstance(said, Mapping) and said:
+        blocks.insert(
+            0,
+            Table(
+                title="Measurement",
+                meaning="What the project file says of machine, operator and certificates.",
+                columns=["what", "value"],
+                rows=[[str(name).replace("_", " "), cell(value)] for name, value in said.items()],
+            ),
+        )
     if provenance.inputs:
         blocks.append(
             Table(
