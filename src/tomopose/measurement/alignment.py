@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.rotations import exp_rotation, log_rotation
@@ -34,11 +35,11 @@ class Alignment:
     def none(cls) -> Alignment:
         return cls(R=np.eye(3), t=np.zeros(3))
 
-    def points(self, x: Any) -> Array:
+    def points(self, x: npt.ArrayLike) -> Array:
         """Points (..., 3) of the part, in W."""
         return np.asarray(x, dtype=np.float64) @ self.R.T + self.t
 
-    def directions(self, n: Any) -> Array:
+    def directions(self, n: npt.ArrayLike) -> Array:
         """Directions (..., 3) of the part, in W."""
         return np.asarray(n, dtype=np.float64) @ self.R.T
 
@@ -69,7 +70,7 @@ class Datum:
     places: Array
 
 
-def datum(kind: str, point: Any, direction: Any) -> Datum:
+def datum(kind: str, point: npt.ArrayLike, direction: npt.ArrayLike) -> Datum:
     """A feature as a datum; direction is ignored for spheres and calottes."""
     x = np.asarray(point, dtype=np.float64)
     if kind in ("sphere", "calotte"):

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from tomopose.errors import InputError
 from tomopose.measurement.features.shapes import frame_along
@@ -39,8 +39,8 @@ class Probing:
 
 def probe(
     volume: Volume,
-    points: Any,
-    normals: Any,
+    points: npt.ArrayLike,
+    normals: npt.ArrayLike,
     *,
     settings: EdgeSettings | None = None,
     search_mm: float | None = None,
@@ -69,7 +69,7 @@ def probe(
 
 
 def sphere_pattern(
-    centre: Any, radius: float, n: int, *, axis: Any = (0, 0, 1), cap: float = np.pi
+    centre: npt.ArrayLike, radius: float, n: int, *, axis: npt.ArrayLike = (0, 0, 1), cap: float = np.pi
 ) -> tuple[Array, Array]:
     """n points spread evenly over the cap of a sphere within the angle `cap`, rad, of `axis`; pi for all of it."""
     k = np.arange(n) + 0.5
@@ -81,7 +81,7 @@ def sphere_pattern(
 
 
 def cylinder_pattern(
-    point: Any, direction: Any, radius: float, length: float, n: int, *, half_angle: float = 0.0
+    point: npt.ArrayLike, direction: npt.ArrayLike, radius: float, length: float, n: int, *, half_angle: float = 0.0
 ) -> tuple[Array, Array]:
     """About n points on a cylinder, or a cone widening along its direction, of `length` mm about `point`."""
     frame = frame_along(np.asarray(direction, dtype=np.float64))
@@ -97,7 +97,9 @@ def cylinder_pattern(
     return np.asarray(point, dtype=np.float64) + local @ frame, normal @ frame
 
 
-def plane_pattern(point: Any, normal: Any, u: Any, v: Any, n: int) -> tuple[Array, Array]:
+def plane_pattern(
+    point: npt.ArrayLike, normal: npt.ArrayLike, u: npt.ArrayLike, v: npt.ArrayLike, n: int
+) -> tuple[Array, Array]:
     """About n points on the rectangle point +- u +- v, (3,) half sides in mm, with the outward normal given."""
     u, v = np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64)
     n_u = max(round(np.sqrt(n * np.linalg.norm(u) / np.linalg.norm(v))), 2)
@@ -108,7 +110,7 @@ def plane_pattern(point: Any, normal: Any, u: Any, v: Any, n: int) -> tuple[Arra
     return np.asarray(point, dtype=np.float64) + points, np.broadcast_to(out / np.linalg.norm(out), points.shape).copy()
 
 
-def circle_pattern(centre: Any, direction: Any, radius: float, n: int) -> tuple[Array, Array]:
+def circle_pattern(centre: npt.ArrayLike, direction: npt.ArrayLike, radius: float, n: int) -> tuple[Array, Array]:
     """n points on a circle about `direction`, with normals away from its centre."""
     frame = frame_along(np.asarray(direction, dtype=np.float64))
     a = 2 * np.pi * np.arange(n) / n
@@ -116,7 +118,9 @@ def circle_pattern(centre: Any, direction: Any, radius: float, n: int) -> tuple[
     return np.asarray(centre, dtype=np.float64) + radius * normals, normals
 
 
-def line_pattern(point: Any, direction: Any, normal: Any, length: float, n: int) -> tuple[Array, Array]:
+def line_pattern(
+    point: npt.ArrayLike, direction: npt.ArrayLike, normal: npt.ArrayLike, length: float, n: int
+) -> tuple[Array, Array]:
     """n points on a line of `length` mm about `point`, with the normal given, made perpendicular to the line."""
     along = frame_along(np.asarray(direction, dtype=np.float64))[2]
     out = np.asarray(normal, dtype=np.float64)

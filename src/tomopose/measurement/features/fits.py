@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.measurement.features.correlation import Independence, independence
@@ -65,10 +66,10 @@ Fit = Callable[[Array, Array], tuple[Array, list[Block]]]
 
 
 def fit_plane(
-    points: Any,
+    points: npt.ArrayLike,
     *,
-    sigma: Any = None,
-    area: Any = None,
+    sigma: npt.ArrayLike | None = None,
+    area: npt.ArrayLike | None = None,
     outliers: float | None = None,
     correlation_range: float = 0.0,
 ) -> Feature:
@@ -80,10 +81,10 @@ def fit_plane(
 
 
 def fit_line(
-    points: Any,
+    points: npt.ArrayLike,
     *,
-    sigma: Any = None,
-    area: Any = None,
+    sigma: npt.ArrayLike | None = None,
+    area: npt.ArrayLike | None = None,
     outliers: float | None = None,
     correlation_range: float = 0.0,
 ) -> Feature:
@@ -92,10 +93,10 @@ def fit_line(
 
 
 def fit_circle(
-    points: Any,
+    points: npt.ArrayLike,
     *,
-    sigma: Any = None,
-    area: Any = None,
+    sigma: npt.ArrayLike | None = None,
+    area: npt.ArrayLike | None = None,
     outliers: float | None = None,
     correlation_range: float = 0.0,
 ) -> Feature:
@@ -104,11 +105,11 @@ def fit_circle(
 
 
 def fit_sphere(
-    points: Any,
+    points: npt.ArrayLike,
     *,
     radius: float | None = None,
-    sigma: Any = None,
-    area: Any = None,
+    sigma: npt.ArrayLike | None = None,
+    area: npt.ArrayLike | None = None,
     outliers: float | None = None,
     correlation_range: float = 0.0,
 ) -> Feature:
@@ -122,11 +123,11 @@ def fit_sphere(
 
 
 def fit_cylinder(
-    points: Any,
+    points: npt.ArrayLike,
     *,
-    direction: Any = None,
-    sigma: Any = None,
-    area: Any = None,
+    direction: npt.ArrayLike | None = None,
+    sigma: npt.ArrayLike | None = None,
+    area: npt.ArrayLike | None = None,
     outliers: float | None = None,
     correlation_range: float = 0.0,
 ) -> Feature:
@@ -143,11 +144,11 @@ def fit_cylinder(
 
 
 def fit_cone(
-    points: Any,
+    points: npt.ArrayLike,
     *,
-    direction: Any = None,
-    sigma: Any = None,
-    area: Any = None,
+    direction: npt.ArrayLike | None = None,
+    sigma: npt.ArrayLike | None = None,
+    area: npt.ArrayLike | None = None,
     outliers: float | None = None,
     correlation_range: float = 0.0,
 ) -> Feature:
@@ -160,7 +161,7 @@ def fit_cone(
 # -- the common part -------------------------------------------------------------------------------------------------
 
 
-def _checked(kind: str, points: Any, sigma: Any, area: Any) -> tuple[Array, Array, Array]:
+def _checked(kind: str, points: npt.ArrayLike, sigma: npt.ArrayLike, area: npt.ArrayLike) -> tuple[Array, Array, Array]:
     x = np.asarray(points, dtype=np.float64)
     if x.ndim != 2 or x.shape[1] != 3:
         raise ShapeError(f"points of a {kind} are (n, 3); got {x.shape}")
@@ -178,7 +179,13 @@ def _checked(kind: str, points: Any, sigma: Any, area: Any) -> tuple[Array, Arra
 
 
 def _fit(
-    kind: str, fit: Fit, points: Any, sigma: Any, area: Any, outliers: float | None, correlation_range: float
+    kind: str,
+    fit: Fit,
+    points: npt.ArrayLike,
+    sigma: npt.ArrayLike,
+    area: npt.ArrayLike,
+    outliers: float | None,
+    correlation_range: float,
 ) -> Feature:
     x, s, a = _checked(kind, points, sigma, area)
     if outliers is not None and not outliers > 0:
@@ -330,7 +337,7 @@ def _circle(points: Array, sigma: Array) -> tuple[Array, list[Block]]:
     ]
 
 
-def _about_axis(kind: str, points: Array, sigma: Array, direction: Any) -> tuple[Array, list[Block]]:
+def _about_axis(kind: str, points: Array, sigma: Array, direction: npt.ArrayLike) -> tuple[Array, list[Block]]:
     x, centre, scale = _scaled(points)
     spread = np.linalg.svd(x, compute_uv=False)
     if spread[1] <= DEGENERATE * spread[0]:

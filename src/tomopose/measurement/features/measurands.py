@@ -19,9 +19,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from tomopose.coverage import combined
 from tomopose.errors import InputError
@@ -135,7 +136,7 @@ def form(feature: Feature, which: str, *, all_points: bool = True) -> Measured:
     )
 
 
-def position(feature: Feature, nominal: Any) -> Measured:
+def position(feature: Feature, nominal: npt.ArrayLike) -> Measured:
     """Position deviation, mm: twice the distance of the feature's point from `nominal` (3,); for an axis, across it."""
     x = np.asarray(nominal, dtype=np.float64)
     if x.shape != (3,):

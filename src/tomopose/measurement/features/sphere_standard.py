@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.measurement.alignment import Alignment, from_points
@@ -74,7 +74,7 @@ def find_spheres(surface: Surface, radius: float) -> Array:
     return np.array([centre for _, centre in sorted(centres, key=lambda item: -item[0])])
 
 
-def identify_spheres(found: Any, calibrated: Any, *, tolerance: float) -> Identified:
+def identify_spheres(found: npt.ArrayLike, calibrated: npt.ArrayLike, *, tolerance: float) -> Identified:
     """Which found centre (m, 3) is which calibrated one (n, 3), by their constellation; mm, frames of their own.
 
     tolerance: by how much a distance may differ, mm.
@@ -212,7 +212,7 @@ def scale_factor(found: Array, calibrated: Array) -> float:
 
 def measure_spheres(
     surface: Surface,
-    calibrated: Any,
+    calibrated: npt.ArrayLike,
     diameter: float,
     *,
     tolerance: float = 0.3,

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from tomopose.errors import InputError, ShapeError, UnitError
 from tomopose.measurement.mesh.mesh import Mesh, nearest_triangles
@@ -43,7 +44,7 @@ def read_probed_points(path: str | Path) -> Array:
     return points
 
 
-def corrected_reference(mesh: Mesh, probed: Any, *, interpolation: Interpolation = "cells") -> Mesh:
+def corrected_reference(mesh: Mesh, probed: npt.ArrayLike, *, interpolation: Interpolation = "cells") -> Mesh:
     """The reference shifted to points (n, 3), mm, that a coordinate measuring machine probed.
 
     Each vertex moves along its normal by the deviation of the probed points of its own element:

@@ -12,13 +12,15 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
+from tomopose.units import Array
+
 LEAF = 6
 """Triangles in a box that is not divided further."""
 DEPTH = 64
 
 
 @njit(cache=True)
-def build_tree(low: Any, high: Any, middle: Any) -> Any:
+def build_tree(low: Array, high: Array, middle: Array) -> Any:
     """Boxes of triangles with corners low, high and middle (m, 3), each divided at the median of its longest side.
 
     Returns order (m,), and for each node: box (N, 6), first and last + 1 in order (N, 2), its second child (N,); the
@@ -58,7 +60,7 @@ def build_tree(low: Any, high: Any, middle: Any) -> Any:
 
 
 @njit(cache=True, inline="always")
-def _box_distance(box: Any, node: Any, x: Any, y: Any, z: Any) -> Any:
+def _box_distance(box: Array, node: int, x: float, y: float, z: float) -> Any:
     """Squared distance of a point to a node's box, 0 inside."""
     dx = max(box[node, 0] - x, 0.0, x - box[node, 3])
     dy = max(box[node, 1] - y, 0.0, y - box[node, 4])
@@ -67,7 +69,7 @@ def _box_distance(box: Any, node: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @njit(cache=True)
-def _nearest(t: Any, x: Any, y: Any, z: Any) -> Any:
+def _nearest(t: Array, x: float, y: float, z: float) -> Any:
     """Nearest place of triangle t (9,), its corners one after the other: offset to the point (3), and which part it
     lies on: 0 face, 1 to 3 edge opposite no corner but ab, bc, ca, 4 to 6 corner a, b, c."""
     ax, ay, az = t[0], t[1], t[2]
@@ -101,8 +103,23 @@ def _nearest(t: Any, x: Any, y: Any, z: Any) -> Any:
     return px - s * ux - r * vx, py - s * uy - r * vy, pz - s * uz - r * vz, 0
 
 
+@njit(cache=True)
+def _nearest_of(corners: Array, first: int, last: int, x: float, y: float, z: float) -> Any:
+    """Of the triangles first .. last - 1 the nearest: square of its distance, number, part and offset as `_nearest`."""
+    best, where, part = np.inf, 0, 0
+    bx, by, bz = 0.0, 0.0, 0.0
+    for k in range(first, last):
+        dx, dy, dz, on = _nearest(corners[k], x, y, z)
+        square = dx * dx + dy * dy + dz * dz
+        if square < best:
+            best, where, part, bx, by, bz = square, k, on, dx, dy, dz
+    return best, where, part, bx, by, bz
+
+
 @njit(cache=True, parallel=True)
-def tree_distances(points: Any, corners: Any, order: Any, box: Any, span: Any, second: Any, normals: Any) -> Any:
+def tree_distances(
+    points: Array, corners: Array, order: np.ndarray, box: Array, span: np.ndarray, second: np.ndarray, normals: Array
+) -> Any:
     """(n,) signed distances of points (n, 3) to triangles, and which of them, in the tree's order, is nearest: corners
     (m, 9) and normals (m, 7, 3), of the face, its edges ab, bc, ca and its corners, both in the tree's order."""
     n = points.shape[0]
@@ -120,11 +137,9 @@ def tree_distances(points: Any, corners: Any, order: Any, box: Any, span: Any, s
                 continue
             other = second[node]
             if other < 0:
-                for k in range(span[node, 0], span[node, 1]):
-                    dx, dy, dz, on = _nearest(corners[k], x, y, z)
-                    square = dx * dx + dy * dy + dz * dz
-                    if square < best:
-                        best, where, part, bx, by, bz = square, k, on, dx, dy, dz
+                here = _nearest_of(corners, span[node, 0], span[node, 1], x, y, z)
+                if here[0] < best:
+                    best, where, part, bx, by, bz = here
                 continue
             near, far = node + 1, other
             d_near, d_far = _box_distance(box, near, x, y, z), _box_distance(box, far, x, y, z)

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit, prange
 
 from tomopose.measurement.surface.splines import spline_value
+from tomopose.units import Array
 
 STEP = 0.25
 GAUSS_NEWTON = 12
@@ -51,7 +52,7 @@ BORDER, NO_EDGE, THIN, NOT_CONVERGED = 1, 2, 4, 8
 
 
 @njit(cache=True)
-def _profile(c: Any, p: Any, n: Any, s_0: Any, window: Any, g: Any) -> Any:
+def _profile(c: Array, p: Array, n: Array, s_0: float, window: float, g: Array) -> Any:
     """Samples of p + s n (index units), s = s_0 - window ... s_0 + window; False where the line leaves the array."""
     m = g.shape[0]
     for e in (s_0 - window, s_0 + window):
@@ -66,7 +67,7 @@ def _profile(c: Any, p: Any, n: Any, s_0: Any, window: Any, g: Any) -> Any:
 
 
 @njit(cache=True)
-def _plateaus(g: Any) -> Any:
+def _plateaus(g: Array) -> Any:
     """Means of the first and last voxel of a profile."""
     per_voxel = round(1.0 / STEP) + 1
     a, b = 0.0, 0.0
@@ -77,7 +78,7 @@ def _plateaus(g: Any) -> Any:
 
 
 @njit(cache=True)
-def _crossing(g: Any, level: Any, window: Any) -> Any:
+def _crossing(g: Array, level: float, window: float) -> Any:
     """Falling crossing of `level` nearest to the middle, s relative to it; nan where there is none."""
     best = np.nan
     for k in range(g.shape[0] - 1):
@@ -89,7 +90,7 @@ def _crossing(g: Any, level: Any, window: Any) -> Any:
 
 
 @njit(cache=True)
-def _steepest(c: Any, p: Any, n: Any, search: Any, window: Any) -> Any:
+def _steepest(c: Array, p: Array, n: Array, search: float, window: float) -> Any:
     """Where along +-search the grey falls most between the voxel before and the voxel behind."""
     best, where = -np.inf, np.nan
     steps = round(2 * search / STEP)
@@ -113,7 +114,7 @@ def _steepest(c: Any, p: Any, n: Any, search: Any, window: Any) -> Any:
 
 
 @njit(cache=True)
-def _another_edge(g: Any, s: Any, a: Any, b: Any, window: Any) -> Any:
+def _another_edge(g: Array, s: float, a: float, b: float, window: float) -> Any:
     """True where the grey rises behind the edge at s and falls again, or falls before it and rises: a thin wall or gap.
 
     Means over a voxel are compared with the outermost ones, a and b.
@@ -133,7 +134,7 @@ def _another_edge(g: Any, s: Any, a: Any, b: Any, window: Any) -> Any:
 
 
 @njit(cache=True)
-def _fit_edge(g: Any, sigma: Any, window: Any, start: Any, a: Any, b: Any, out: Any) -> Any:
+def _fit_edge(g: Array, sigma: float, window: float, start: float, a: float, b: float, out: Array) -> Any:
     """Gauss-Newton for s_0, a, b; writes a row of results, s_0 relative to the profile's middle.  True if converged."""
     m = g.shape[0]
     s_0, converged = start, False
@@ -199,7 +200,7 @@ def _fit_edge(g: Any, sigma: Any, window: Any, start: Any, a: Any, b: Any, out: 
 
 
 @njit(cache=True)
-def _judge(g: Any, sigma: Any, window: Any, s_0: Any, a: Any, b: Any, out: Any) -> Any:
+def _judge(g: Array, sigma: float, window: float, s_0: float, a: float, b: float, out: Array) -> Any:
     """Residuals of the fit, the flatness of both plateaus, and the sums for a common step in sigma."""
     m = g.shape[0]
     square = up = down = 0.0
@@ -232,7 +233,7 @@ def _judge(g: Any, sigma: Any, window: Any, s_0: Any, a: Any, b: Any, out: Any) 
 
 
 @njit(cache=True)
-def _beyond(c: Any, p: Any, n: Any, middle: Any, sigma: Any, window: Any, longer: Any, out: Any) -> Any:
+def _beyond(c: Array, p: Array, n: Array, middle: float, sigma: float, window: float, longer: float, out: Array) -> Any:
     """Mean grey from the window's ends to `longer` beyond them, into a row of results; nan for both where the line
     leaves the array, or where another edge is so near that its blur reaches there."""
     steps = round(longer / COARSE)
@@ -266,7 +267,9 @@ def _beyond(c: Any, p: Any, n: Any, middle: Any, sigma: Any, window: Any, longer
 
 
 @njit(cache=True, parallel=True)
-def search_lines(c: Any, index: Any, step: Any, sigma: Any, window: Any, search: Any, fit: Any, longer: Any) -> Any:
+def search_lines(
+    c: Array, index: Array, step: Array, sigma: float, window: float, search: float, fit: bool, longer: float
+) -> Any:
     """Edges along n lines.
 
     c: spline coefficients [z, y, x]; index (n, 3): start points as (iz, iy, ix); step (n, 3): the normal's unit length

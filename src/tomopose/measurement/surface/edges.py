@@ -12,9 +12,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntFlag
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.measurement.surface import edge_kernel as kernel
@@ -130,8 +131,8 @@ def counts_in_words(flags: np.ndarray) -> str:
 
 def search_edges(
     volume: Volume,
-    points: Any,
-    normals: Any,
+    points: npt.ArrayLike,
+    normals: npt.ArrayLike,
     settings: EdgeSettings,
     *,
     contrast: float | None = None,
@@ -166,7 +167,7 @@ def search_edges(
     return edges if settings.plateau_radius == 0 else _shared(edges, result, x, n, unit, settings.plateau_radius)
 
 
-def _checked(points: Any, normals: Any) -> tuple[Array, Array]:
+def _checked(points: npt.ArrayLike, normals: npt.ArrayLike) -> tuple[Array, Array]:
     x, n = np.asarray(points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
     if x.ndim != 2 or x.shape[1] != 3 or n.shape != x.shape:
         raise ShapeError(f"points and normals are both (n, 3); got {x.shape} and {n.shape}")

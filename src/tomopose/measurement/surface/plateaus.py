@@ -53,7 +53,7 @@ def shared_plateaus(points: Array, normals: Array, own: Array, radius: float) ->
 
 
 @njit(cache=True)
-def _first(key: Any, wanted: Any) -> Any:
+def _first(key: np.ndarray, wanted: int) -> Any:
     """First index of sorted key at or above wanted."""
     low, high = 0, key.shape[0]
     while low < high:
@@ -66,36 +66,36 @@ def _first(key: Any, wanted: Any) -> Any:
 
 
 @njit(cache=True, inline="always")
-def _near(x: Any, n: Any, i: Any, k: Any, radius: Any) -> Any:
+def _near(x: Array, n: Array, i: int, k: int, radius: float) -> Any:
     """Whether point k lies within radius of point i and looks the same way."""
     square = (x[k, 0] - x[i, 0]) ** 2 + (x[k, 1] - x[i, 1]) ** 2 + (x[k, 2] - x[i, 2]) ** 2
     return square <= radius * radius and n[k, 0] * n[i, 0] + n[k, 1] * n[i, 1] + n[k, 2] * n[i, 2] >= SAME_SIDE
 
 
 @njit(cache=True, parallel=True)
-def _inner(x: Any, n: Any, key: Any, size: Any, radius: Any) -> Any:
+def _inner(x: Array, n: Array, key: np.ndarray, size: np.ndarray, radius: float) -> Any:
     """(n,) whether a point's neighbours lie all around it; points are sorted by the key of their cell."""
     m = x.shape[0]
     inner = np.zeros(m, dtype=np.bool_)
     for i in prange(m):
         total, found = np.zeros(3), 0
-        for dz in range(-1, 2):
-            for dy in range(-1, 2):
-                # The three cells of a row follow one another.
-                row = key[i] + (dz * size[1] + dy) * size[0]
-                k = _first(key, row - 1)
-                while k < m and key[k] <= row + 1:
-                    if _near(x, n, i, k, radius):
-                        found += 1
-                        for a in range(3):
-                            total[a] += x[k, a] - x[i, a]
-                    k += 1
+        for line in range(9):
+            # The three cells of a row follow one another; nine rows surround a point.
+            row = key[i] + ((line // 3 - 1) * size[1] + line % 3 - 1) * size[0]
+            k = _first(key, row - 1)
+            while k < m and key[k] <= row + 1:
+                if _near(x, n, i, k, radius):
+                    found += 1
+                    total += x[k] - x[i]
+                k += 1
         inner[i] = np.sqrt(np.sum(total * total)) <= ONE_SIDED * radius * found
     return inner
 
 
 @njit(cache=True, parallel=True)
-def _trimmed_means(x: Any, n: Any, values: Any, key: Any, size: Any, radius: Any, lends: Any) -> Any:
+def _trimmed_means(
+    x: Array, n: Array, values: Array, key: np.ndarray, size: np.ndarray, radius: float, lends: np.ndarray
+) -> Any:
     """Trimmed means (n, c) of values (n, c) over the neighbours that lend, itself included, and their number (n,)."""
     m, c = values.shape
     mean, count = np.empty((m, c)), np.empty(m)
@@ -103,16 +103,14 @@ def _trimmed_means(x: Any, n: Any, values: Any, key: Any, size: Any, radius: Any
         near, found = np.empty((c, MOST)), 1
         for a in range(c):
             near[a, 0] = values[i, a]
-        for dz in range(-1, 2):
-            for dy in range(-1, 2):
-                row = key[i] + (dz * size[1] + dy) * size[0]
-                k = _first(key, row - 1)
-                while k < m and key[k] <= row + 1 and found < MOST:
-                    if k != i and lends[k] and _near(x, n, i, k, radius):
-                        for a in range(c):
-                            near[a, found] = values[k, a]
-                        found += 1
-                    k += 1
+        for line in range(9):
+            row = key[i] + ((line // 3 - 1) * size[1] + line % 3 - 1) * size[0]
+            k = _first(key, row - 1)
+            while k < m and key[k] <= row + 1 and found < MOST:
+                if k != i and lends[k] and _near(x, n, i, k, radius):
+                    near[:, found] = values[k]
+                    found += 1
+                k += 1
         cut = int(TRIMMED * found)
         for a in range(c):
             mean[i, a] = np.mean(np.sort(near[a, :found])[cut : found - cut])

@@ -32,7 +32,7 @@ def spline_coefficients(values: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def _filter_row(row: Any) -> Any:
+def _filter_row(row: Array) -> Any:
     n = row.shape[0]
     total, power = 0.0, 1.0
     for k in range(min(n, 2 * REACH)):
@@ -49,7 +49,7 @@ def _filter_row(row: Any) -> Any:
 
 
 @njit(cache=True, parallel=True)
-def _filter_along_x(c: Any) -> Any:
+def _filter_along_x(c: Array) -> Any:
     for z in prange(c.shape[0]):
         row = np.empty(c.shape[2])
         for y in range(c.shape[1]):
@@ -59,19 +59,19 @@ def _filter_along_x(c: Any) -> Any:
 
 
 @njit(cache=True, parallel=True)
-def _filter_along_y(c: Any) -> Any:
+def _filter_along_y(c: Array) -> Any:
     for z in prange(c.shape[0]):
         _filter_plane(c[z])
 
 
 @njit(cache=True, parallel=True)
-def _filter_along_z(c: Any) -> Any:
+def _filter_along_z(c: Array) -> Any:
     for y in prange(c.shape[1]):
         _filter_plane(c[:, y])
 
 
 @njit(cache=True)
-def _filter_plane(plane: Any) -> Any:
+def _filter_plane(plane: Array) -> Any:
     """The filter along the first axis, a whole row at a time."""
     n, m = plane.shape
     first = np.zeros(m)
@@ -97,7 +97,7 @@ def _filter_plane(plane: Any) -> Any:
 
 
 @njit(cache=True, inline="always")
-def _weights(t: Any) -> Any:
+def _weights(t: float) -> Any:
     """The four cubic B-spline weights at the fraction t of a voxel."""
     s = 1.0 - t
     return (
@@ -109,7 +109,7 @@ def _weights(t: Any) -> Any:
 
 
 @njit(cache=True)
-def spline_value(c: Any, z: Any, y: Any, x: Any) -> Any:
+def spline_value(c: Array, z: float, y: float, x: float) -> Any:
     """The spline at (z, y, x), which must lie at least one voxel inside the array."""
     iz, iy, ix = math.floor(z), math.floor(y), math.floor(x)
     wz, wy, wx = _weights(z - iz), _weights(y - iy), _weights(x - ix)
@@ -125,7 +125,7 @@ def spline_value(c: Any, z: Any, y: Any, x: Any) -> Any:
 
 
 @njit(cache=True)
-def _gauss(position: Any, sigma: Any, centre: Any, reach: Any, out: Any) -> Any:
+def _gauss(position: float, sigma: float, centre: float, reach: int, out: Array) -> Any:
     """Normalised Gaussian weights, their first and second derivatives, at the voxels around `position`."""
     norm = 0.0
     for k in range(2 * reach + 1):
@@ -141,7 +141,7 @@ def _gauss(position: Any, sigma: Any, centre: Any, reach: Any, out: Any) -> Any:
 
 
 @njit(cache=True, parallel=True)
-def smoothed_gradients(values: Any, index: Any, sigma: Any) -> Any:
+def smoothed_gradients(values: np.ndarray, index: Array, sigma: float) -> Any:
     """(n, 3) gradients (d/dz, d/dy, d/dx), per voxel, of the volume smoothed by a Gaussian of `sigma` voxels, at index
     (n, 3).  Voxels beyond the border repeat the outermost."""
     reach = math.ceil(GAUSS_REACH * sigma)
@@ -169,7 +169,7 @@ def smoothed_gradients(values: Any, index: Any, sigma: Any) -> Any:
 
 
 @njit(cache=True, parallel=True)
-def smoothed_curvatures(values: Any, index: Any, spacing: Any, sigma: Any) -> Any:
+def smoothed_curvatures(values: np.ndarray, index: Array, spacing: Array, sigma: float) -> Any:
     """(n,) mean curvature (k_1 + k_2) / 2, 1/mm, of the grey level's surface through index (n, 3), smoothed likewise.
 
     Positive where the brighter side is convex: -div(grad g / |grad g|) / 2.  spacing: (z, y, x) in mm.
