@@ -129,6 +129,12 @@ def test_a_plan_without_spheres_or_with_a_corrected_scale_has_no_protocol():
     plan = plan_from(content)
     with pytest.raises(InputError, match="scale_correction"):
         acceptance_protocol(results_of(plan), plan, "scan")
+    bare = document()
+    del bare["spheres"]
+    bare["features"] = {"ball": {"kind": "sphere", "point": [0, 0, 0], "radius_mm": 2.5}}
+    bare["measurands"] = [{"name": "D", "kind": "diameter", "of": ["ball"]}]
+    with pytest.raises(InputError, match=r"needs \[spheres\]"):
+        acceptance_protocol(results_of(plan), plan_from(bare), "scan")
     with pytest.raises(InputError, match="no results"):
         acceptance_protocol(results_of(plan_from(document())), plan_from(document()), "other")
 

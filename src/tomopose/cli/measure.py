@@ -135,6 +135,7 @@ def measure(options: Options) -> int:
 
     from tomopose.files import atomic_folder, require_absent
     from tomopose.io.volume_files import read_volume
+    from tomopose.measurement.acceptance.protocol import tested_spheres
     from tomopose.measurement.measure import measure as carry_out
     from tomopose.measurement.plan import read_plan
     from tomopose.measurement.results import write_results
@@ -150,6 +151,8 @@ def measure(options: Options) -> int:
     for name in ("report.html", "measurement.json"):
         require_absent(o.out / name, force=o.force)
     plan = read_plan(o.plan)
+    if o.protocol:
+        tested_spheres(plan)
     files = named_files(o.volume, "volume")
     mesh = None if o.reference is None else reference_of(o.reference, o.edge_mm, o.probed, o.between)
     volumes = {name: read_volume(file) for name, file in files.items()}

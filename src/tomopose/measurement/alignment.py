@@ -70,7 +70,7 @@ class Datum:
     places: Array
 
 
-def datum(kind: str, point: npt.ArrayLike, direction: npt.ArrayLike) -> Datum:
+def datum(kind: str, point: npt.ArrayLike, direction: npt.ArrayLike | None) -> Datum:
     """A feature as a datum; direction is ignored for spheres and calottes."""
     x = np.asarray(point, dtype=np.float64)
     if kind in ("sphere", "calotte"):

@@ -21,7 +21,7 @@ from tomopose.measurement.features.fits import (
 from tomopose.measurement.features.sphere_standard import CORRELATION_VOXELS, measure_spheres, scale_factor
 from tomopose.measurement.plan import FeaturePlan, MeasurementPlan
 from tomopose.measurement.probing import probe
-from tomopose.measurement.regions import nominal_pattern, surface_region
+from tomopose.measurement.regions import given, nominal_pattern, surface_region
 from tomopose.measurement.surface.edges import EdgeSettings, counts_in_words
 from tomopose.measurement.surface.grey_levels import GreyLevels, given_levels, grey_levels
 from tomopose.measurement.surface.surface import Surface, surface
@@ -102,10 +102,11 @@ class Bench:
         for name in self.plan.alignment.datums:
             p = self.plan.features[name]
             f = self._feature(name, p, alignment)
-            direction = _outward(p) if p.kind == "plane" else p.direction
+            given_direction = None if p.direction is None else np.asarray(p.direction, dtype=np.float64)
+            direction = _outward(p) if p.kind == "plane" else given_direction
             nominal.append(datum(p.kind, p.point, direction))
             along = None if direction is None or f.kind in ("sphere", "calotte") else f.direction
-            if along is not None and along @ alignment.directions(direction) < 0:
+            if along is not None and direction is not None and along @ alignment.directions(direction) < 0:
                 along = -along
             measured.append(datum(p.kind, f.point, along))
         return from_datums((nominal[0], nominal[1], nominal[2]), (measured[0], measured[1], measured[2]))
@@ -127,7 +128,7 @@ class Bench:
         except InputError as error:
             raise InputError(f"feature {name!r}: {error}") from error
         if plan.kind == "line":
-            feature = _signed(feature, alignment.directions(plan.normal))
+            feature = _signed(feature, alignment.directions(given(plan.normal)))
         if plan.kind == "plane" and feature.direction @ normals.mean(axis=0) < 0:
             feature = _turned(feature)
         if plan.source == "normals" and self.plan.surface.curvature_correction:

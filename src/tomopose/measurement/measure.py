@@ -15,6 +15,7 @@ from tomopose.measurement.bench import Bench, by_reference, sphere_name
 from tomopose.measurement.features import measurands as m
 from tomopose.measurement.features.feature import Feature, noise_range
 from tomopose.measurement.plan import ANGLES, LimitPlan, MeasurandPlan, MeasurementPlan, SpheresPlan
+from tomopose.measurement.regions import given
 from tomopose.measurement.result import FORMS, MeasurementResult
 from tomopose.measurement.results import MeasurementResults
 from tomopose.provenance import Provenance
@@ -145,7 +146,7 @@ def _evaluated(p: MeasurandPlan, features: tuple[Feature, ...], alignment: Align
     if p.kind == "apex_angle":
         return m.apex_angle(one)
     if p.kind == "position":
-        return m.position(one, alignment.points(p.nominal_point))
+        return m.position(one, alignment.points(given(p.nominal_point)))
     if p.kind in FORMS:
         return m.form(one, p.kind, all_points=p.points == "all")
     return m.coordinate(one, p.kind)

@@ -7,6 +7,8 @@ and 15 degrees (sec. 6.2).
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 
 from tomopose.errors import InputError
@@ -15,6 +17,8 @@ from tomopose.measurement.features.shapes import frame_along
 from tomopose.measurement.plan import FeaturePlan
 from tomopose.measurement.probing import circle_pattern, cylinder_pattern, line_pattern, plane_pattern, sphere_pattern
 from tomopose.units import Array
+
+T = TypeVar("T")
 
 
 def without_edges(points: Array, angle: Array, max_angle: float, safety: float) -> np.ndarray:
@@ -38,33 +42,37 @@ def nominal_pattern(plan: FeaturePlan, alignment: Alignment) -> tuple[Array, Arr
     point = alignment.points(plan.point)
     s = plan.safety_mm
     if plan.kind in ("sphere", "calotte"):
-        radius = _given(plan.radius_mm)
-        cap = np.pi if plan.kind == "sphere" else np.radians(_given(plan.cap_deg)) - s / radius
+        radius = given(plan.radius_mm)
+        cap = np.pi if plan.kind == "sphere" else np.radians(given(plan.cap_deg)) - s / radius
         _require_left(plan.kind, float(cap))
-        axis = (0.0, 0.0, 1.0) if plan.direction is None else alignment.directions(plan.direction)
+        axis = (0.0, 0.0, 1.0) if plan.direction is None else alignment.directions(given(plan.direction))
         x, n = sphere_pattern(point, radius, plan.n_points, axis=axis, cap=float(cap))
     elif plan.kind == "plane":
         u, v = (np.asarray(w, dtype=np.float64) for w in (plan.u, plan.v))
         sides = [w * (1 - s / float(np.linalg.norm(w))) for w in (u, v)]
         _require_left(plan.kind, float(min(np.linalg.norm(w) for w in (u, v))) - s)
         half_u, half_v = (alignment.directions(w) for w in sides)
-        x, n = plane_pattern(point, alignment.directions(plan.direction), half_u, half_v, plan.n_points)
+        x, n = plane_pattern(point, alignment.directions(given(plan.direction)), half_u, half_v, plan.n_points)
     elif plan.kind == "circle":
-        x, n = circle_pattern(point, alignment.directions(plan.direction), _given(plan.radius_mm), plan.n_points)
+        x, n = circle_pattern(point, alignment.directions(given(plan.direction)), given(plan.radius_mm), plan.n_points)
     elif plan.kind == "line":
-        length = _given(plan.length_mm) - 2 * s
+        length = given(plan.length_mm) - 2 * s
         _require_left(plan.kind, length)
         x, n = line_pattern(
-            point, alignment.directions(plan.direction), alignment.directions(plan.normal), length, plan.n_points
+            point,
+            alignment.directions(given(plan.direction)),
+            alignment.directions(given(plan.normal)),
+            length,
+            plan.n_points,
         )
     else:
-        length = _given(plan.length_mm) - 2 * s
+        length = given(plan.length_mm) - 2 * s
         _require_left(plan.kind, length)
-        half_angle = np.radians(_given(plan.half_angle_deg)) if plan.kind == "cone" else 0.0
+        half_angle = np.radians(given(plan.half_angle_deg)) if plan.kind == "cone" else 0.0
         x, n = cylinder_pattern(
             point,
-            alignment.directions(plan.direction),
-            _given(plan.radius_mm),
+            alignment.directions(given(plan.direction)),
+            given(plan.radius_mm),
             length,
             plan.n_points,
             half_angle=float(half_angle),
@@ -81,11 +89,11 @@ def surface_region(plan: FeaturePlan, alignment: Alignment, points: Array, norma
     if plan.kind in ("sphere", "calotte"):
         rho = np.linalg.norm(x, axis=1)
         outward = x / np.maximum(rho, 1e-300)[:, None]
-        off, inside = rho - _given(plan.radius_mm), np.ones(len(x), dtype=bool)
+        off, inside = rho - given(plan.radius_mm), np.ones(len(x), dtype=bool)
         if plan.kind == "calotte":
             axis = frame_along(np.asarray(plan.direction))[2]
-            inside = np.arccos(np.clip(outward @ axis, -1, 1)) <= np.radians(_given(plan.cap_deg)) - s / max(
-                _given(plan.radius_mm), 1e-9
+            inside = np.arccos(np.clip(outward @ axis, -1, 1)) <= np.radians(given(plan.cap_deg)) - s / max(
+                given(plan.radius_mm), 1e-9
             )
     elif plan.kind == "plane":
         frame = frame_along(np.asarray(plan.direction))
@@ -96,10 +104,10 @@ def surface_region(plan: FeaturePlan, alignment: Alignment, points: Array, norma
     else:
         frame = frame_along(np.asarray(plan.direction))
         y = x @ frame.T
-        psi = np.radians(_given(plan.half_angle_deg)) if plan.kind == "cone" else 0.0
+        psi = np.radians(given(plan.half_angle_deg)) if plan.kind == "cone" else 0.0
         rho = np.maximum(np.hypot(y[:, 0], y[:, 1]), 1e-300)
-        off = (rho - _given(plan.radius_mm)) * np.cos(psi) - y[:, 2] * np.sin(psi)
-        inside = np.abs(y[:, 2]) <= _given(plan.length_mm) / 2 - s
+        off = (rho - given(plan.radius_mm)) * np.cos(psi) - y[:, 2] * np.sin(psi)
+        inside = np.abs(y[:, 2]) <= given(plan.length_mm) / 2 - s
         radial = np.column_stack([y[:, 0] / rho, y[:, 1] / rho, np.zeros(len(y))])
         outward = (radial * np.cos(psi) - np.array([0, 0, np.sin(psi)])) @ frame
     near = np.flatnonzero(inside & (np.abs(off) <= band))
@@ -112,7 +120,8 @@ def surface_region(plan: FeaturePlan, alignment: Alignment, points: Array, norma
     return mask
 
 
-def _given(value: float | None) -> float:
+def given(value: T | None) -> T:
+    """A number or vector of a feature's nominal geometry.  InputError where the plan does not hold it."""
     if value is None:
         raise InputError("the feature's nominal geometry is incomplete")
     return value

@@ -149,18 +149,23 @@ class Protocol:
         return text.getvalue()
 
 
+def tested_spheres(plan: MeasurementPlan) -> SpheresPlan:
+    """The multi-sphere standard of a plan.  InputError where it has none, or corrects the scale by it."""
+    if plan.spheres is None:
+        raise InputError("the acceptance protocol is of a multi-sphere standard: the plan needs [spheres]")
+    if plan.spheres.scale_correction:
+        raise InputError("the acceptance test is of the instrument as it is: set scale_correction = false in [spheres]")
+    return plan.spheres
+
+
 def acceptance_protocol(results: MeasurementResults, plan: MeasurementPlan, volume: str) -> Protocol:
     """The protocol of one volume of `results`, which `measure` made of a plan with [spheres] and [acceptance].
 
     Raises InputError where the plan has no spheres, or the volume was not measured.
     """
-    spheres = plan.spheres
-    if spheres is None:
-        raise InputError("the acceptance protocol is of a multi-sphere standard: the plan needs [spheres]")
+    spheres = tested_spheres(plan)
     if volume not in results.features:
         raise InputError(f"there are no results of a volume {volume!r}; known: {', '.join(results.volumes)}")
-    if spheres.scale_correction:
-        raise InputError("the acceptance test is of the instrument as it is: set scale_correction = false in [spheres]")
     rows = {r.name: r for r in results.of(volume)}
     numbers = [k for k in range(len(spheres.centres)) if sphere_name(k) in results.features[volume]]
     form = {k: _form_line(rows[f"form_25 {k + 1:02d}"], plan) for k in numbers}

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -161,7 +160,9 @@ def fit_cone(
 # -- the common part -------------------------------------------------------------------------------------------------
 
 
-def _checked(kind: str, points: npt.ArrayLike, sigma: npt.ArrayLike, area: npt.ArrayLike) -> tuple[Array, Array, Array]:
+def _checked(
+    kind: str, points: npt.ArrayLike, sigma: npt.ArrayLike | None, area: npt.ArrayLike | None
+) -> tuple[Array, Array, Array]:
     x = np.asarray(points, dtype=np.float64)
     if x.ndim != 2 or x.shape[1] != 3:
         raise ShapeError(f"points of a {kind} are (n, 3); got {x.shape}")
@@ -182,8 +183,8 @@ def _fit(
     kind: str,
     fit: Fit,
     points: npt.ArrayLike,
-    sigma: npt.ArrayLike,
-    area: npt.ArrayLike,
+    sigma: npt.ArrayLike | None,
+    area: npt.ArrayLike | None,
     outliers: float | None,
     correlation_range: float,
 ) -> Feature:
@@ -243,7 +244,7 @@ def feature_distances(kind: str, vector: Array, points: Array) -> Array:
     return distances(Shape(kind=shape_kind, point=point, frame=frame, radius=float(vector[6]), psi=psi), points)
 
 
-def _vector(point: Array, direction: Any = np.nan, radius: float = np.nan, psi: float = np.nan) -> Array:
+def _vector(point: Array, direction: npt.ArrayLike = np.nan, radius: float = np.nan, psi: float = np.nan) -> Array:
     return np.concatenate([point, np.broadcast_to(direction, (3,)), [radius, psi]])
 
 
@@ -337,7 +338,7 @@ def _circle(points: Array, sigma: Array) -> tuple[Array, list[Block]]:
     ]
 
 
-def _about_axis(kind: str, points: Array, sigma: Array, direction: npt.ArrayLike) -> tuple[Array, list[Block]]:
+def _about_axis(kind: str, points: Array, sigma: Array, direction: npt.ArrayLike | None) -> tuple[Array, list[Block]]:
     x, centre, scale = _scaled(points)
     spread = np.linalg.svd(x, compute_uv=False)
     if spread[1] <= DEGENERATE * spread[0]:

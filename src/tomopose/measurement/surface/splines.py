@@ -32,7 +32,7 @@ def spline_coefficients(values: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def _filter_row(row: Array) -> Any:
+def _filter_row(row: np.ndarray) -> Any:
     n = row.shape[0]
     total, power = 0.0, 1.0
     for k in range(min(n, 2 * REACH)):
@@ -49,7 +49,7 @@ def _filter_row(row: Array) -> Any:
 
 
 @njit(cache=True, parallel=True)
-def _filter_along_x(c: Array) -> Any:
+def _filter_along_x(c: np.ndarray) -> Any:
     for z in prange(c.shape[0]):
         row = np.empty(c.shape[2])
         for y in range(c.shape[1]):
@@ -59,19 +59,19 @@ def _filter_along_x(c: Array) -> Any:
 
 
 @njit(cache=True, parallel=True)
-def _filter_along_y(c: Array) -> Any:
+def _filter_along_y(c: np.ndarray) -> Any:
     for z in prange(c.shape[0]):
         _filter_plane(c[z])
 
 
 @njit(cache=True, parallel=True)
-def _filter_along_z(c: Array) -> Any:
+def _filter_along_z(c: np.ndarray) -> Any:
     for y in prange(c.shape[1]):
         _filter_plane(c[:, y])
 
 
 @njit(cache=True)
-def _filter_plane(plane: Array) -> Any:
+def _filter_plane(plane: np.ndarray) -> Any:
     """The filter along the first axis, a whole row at a time."""
     n, m = plane.shape
     first = np.zeros(m)
