@@ -52,13 +52,11 @@ def _block_means(image: np.ndarray, step: int, potential: bool, out: np.ndarray)
         for i in range(out.shape[1]):
             u_0, u_1 = i * step, min((i + 1) * step, n_u)
             total = 0.0
-            for v in range(v_0, v_1):
-                for u in range(u_0, u_1):
-                    T = image[v, u]
-                    if not potential:
-                        total += T
-                    elif T != 1.0 and T > 1e-30:
-                        total -= T * np.log(T)
+            for T in image[v_0:v_1, u_0:u_1].flat:
+                if not potential:
+                    total += T
+                elif T != 1.0 and T > 1e-30:
+                    total -= T * np.log(T)
             out[j, i] = total / ((v_1 - v_0) * (u_1 - u_0))
 
 

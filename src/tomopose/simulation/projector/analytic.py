@@ -10,6 +10,8 @@ each cell holds the quadratic surface nearest to the transmission (`cells`), so 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
@@ -31,6 +33,8 @@ from tomopose.simulation.projector.cells import (
 from tomopose.simulation.projector.rays import LARGEST, Compiled
 from tomopose.simulation.projector.sampling import (
     BLOCK,
+    KernelScene,
+    WorkSpace,
     all_corners,
     at,
     coarse_corners,
@@ -51,7 +55,7 @@ SMALL_PX = 8.0
 
 
 @njit(cache=True, nogil=True)
-def _crossing(c: Arrays, work: Arrays, u_0: float, v_0: float, u_1: float, v_1: float, mark: int) -> float:
+def _crossing(c: KernelScene, work: WorkSpace, u_0: float, v_0: float, u_1: float, v_1: float, mark: int) -> float:
     """Where between two points (0 to 1) the surfaces seen change from those of signature `mark`, by halving."""
     lo, hi = 0.0, 1.0
     for _ in range(HALVINGS):
@@ -65,7 +69,7 @@ def _crossing(c: Arrays, work: Arrays, u_0: float, v_0: float, u_1: float, v_1: 
 
 @njit(cache=True, nogil=True)
 def _split_cell(
-    c: Arrays, work: Arrays, left: float, low: float, h: float, along_u: bool, marks: Arrays, M: np.ndarray
+    c: KernelScene, work: WorkSpace, left: float, low: float, h: float, along_u: bool, marks: Arrays, M: np.ndarray
 ) -> None:
     """Gather in M the moments of a cell that a steep edge crosses.
 
@@ -107,8 +111,93 @@ def _split_cell(
 
 
 @njit(cache=True, nogil=True)
+def _nodes(
+    c: KernelScene,
+    work: WorkSpace,
+    I: np.ndarray,
+    seen: np.ndarray,
+    j: int,
+    i: int,
+    f: int,
+    left: float,
+    low: float,
+    node: np.ndarray,
+    node_seen: np.ndarray,
+) -> None:
+    """Transmission and signature at the (f + 1) x (f + 1) corners of the cells of pixel (j, i); its own are known."""
+    h = 1.0 / f
+    for a in range(f + 1):
+        for b in range(f + 1):
+            if a in (0, f) and b in (0, f):
+                node[a, b], node_seen[a, b] = I[j + a // f, i + b // f], seen[j + a // f, i + b // f]
+            else:
+                node[a, b], node_seen[a, b] = at(c, work, left + b * h, low + a * h)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _edge_runs(m: np.ndarray, along_u: bool) -> Any:
+    """Whether the edge in a cell is crossed along u, and the corners' signatures in that order, from m[v, u].
+
+    along_u: what the slopes say, which counts where as many sides of either direction are cut.
+    """
+    sides_u = int(m[0, 0] != m[0, 1]) + int(m[1, 0] != m[1, 1])
+    sides_v = int(m[0, 0] != m[1, 0]) + int(m[0, 1] != m[1, 1])
+    if sides_u != sides_v:
+        along_u = sides_u > sides_v
+    return along_u, (m[0, 0], m[0, 1], m[1, 0], m[1, 1]) if along_u else (m[0, 0], m[1, 0], m[0, 1], m[1, 1])
+
+
+@njit(cache=True, nogil=True)
+def _cell(
+    c: KernelScene,
+    work: WorkSpace,
+    node: np.ndarray,
+    marks: np.ndarray,
+    f: int,
+    left: float,
+    low: float,
+    row: int,
+    column: int,
+    weight: float,
+    out: np.ndarray,
+    M: np.ndarray,
+) -> None:
+    """Add weight x moments of one cell to `out`; node, marks (2, 2): transmission and signature at its corners [v, u];
+    (left, low): its corner on the panel."""
+    h = 1.0 / f
+    f_00, f_01, f_10, f_11 = node[0, 0], node[0, 1], node[1, 0], node[1, 1]
+    same = marks[0, 0] == marks[1, 0] and marks[0, 0] == marks[0, 1] and marks[0, 0] == marks[1, 1]
+    if same and marks[0, 0] == 0:
+        out[0, row, column] += weight
+        return
+    M[:] = 0.0
+    corners = (f_00 + f_01 + f_10 + f_11) / 4
+    middle, _ = at(c, work, left + 0.5 * h, low + 0.5 * h)
+    span = max(f_00, f_01, f_10, f_11, middle) - min(f_00, f_01, f_10, f_11, middle)
+    rise_u, rise_v = f_01 + f_11 - f_00 - f_10, f_10 + f_11 - f_00 - f_01
+    if span < FLAT or (same and abs(middle - corners) < FLAT):
+        twist = weight * f * f * (f_11 - f_10 - f_01 + f_00)
+        value = weight * (2 * middle + corners) / 3
+        add(out, row, column, value, weight * f * rise_u / 2, weight * f * rise_v / 2, twist, 0.0, 0.0)
+        return
+    if span > 24 * FLAT:
+        along_u, m = _edge_runs(marks, abs(rise_u) > abs(rise_v))
+        _split_cell(c, work, left, low, h, along_u, m, M)
+        add_moments(out, row, column, weight, f, M, 0.0, 1 / 12)
+        return
+    points = LATTICE_13 if span > 6 * FLAT else LATTICE_5
+    n = len(points)
+    for q in range(n):
+        x, y = points[q]
+        value, _ = at(c, work, left + (x + 0.5) * h, low + (y + 0.5) * h)
+        gather_value(M, value / n, x, y)
+    xy = (points[:, 0] * points[:, 1]).mean()
+    add_moments(out, row, column, weight, f, M, xy, (1 - 1 / n**2) / 12)
+
+
+@njit(cache=True, nogil=True)
 def _cells(
-    c: Arrays,
+    c: KernelScene,
     depth: int,
     u_0: int,
     v_0: int,
@@ -126,73 +215,23 @@ def _cells(
     node, node_seen = np.empty((f + 1, f + 1)), np.empty((f + 1, f + 1), dtype=np.int64)
     h, M, bow = 1.0 / f, np.empty(HELD), bows(f)
     fill_smooth(I, seen, f, j_0, j_1, weight, out, rough)
-    for j in range(j_0, j_1):
-        for i in range(I.shape[1] - 1):
-            if not rough[j, i]:
+    for j, i in np.argwhere(rough[j_0:j_1]):
+        j += j_0
+        left, low = u_0 + i - 0.5, v_0 + j - 0.5
+        f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
+        mark = seen[j, i]
+        if mark == seen[j, i + 1] and mark == seen[j + 1, i] and mark == seen[j + 1, i + 1]:
+            middle, here = at(c, work, left + 0.5, low + 0.5)
+            off = middle - (f_00 + f_01 + f_10 + f_11) / 4
+            if here == mark and abs(off) < FLAT / 2:
+                # A neighbour meets the edge.  The middle gives the sum of the curvatures alone.
+                fill_pixel(out, j, i, f, weight, bow, f_00, f_01, f_10, f_11, -4 * off, -4 * off)
                 continue
-            left, low = u_0 + i - 0.5, v_0 + j - 0.5
-            f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
-            mark = seen[j, i]
-            if mark == seen[j, i + 1] and mark == seen[j + 1, i] and mark == seen[j + 1, i + 1]:
-                middle, here = at(c, work, left + 0.5, low + 0.5)
-                off = middle - (f_00 + f_01 + f_10 + f_11) / 4
-                if here == mark and abs(off) < FLAT / 2:
-                    # A neighbour meets the edge.  The middle gives the sum of the curvatures alone.
-                    fill_pixel(out, j, i, f, weight, bow, f_00, f_01, f_10, f_11, -4 * off, -4 * off)
-                    continue
-            for a in range(f + 1):
-                for b in range(f + 1):
-                    if a in (0, f) and b in (0, f):
-                        node[a, b], node_seen[a, b] = I[j + a // f, i + b // f], seen[j + a // f, i + b // f]
-                    else:
-                        node[a, b], node_seen[a, b] = at(c, work, left + b * h, low + a * h)
-            for a in range(f):
-                for b in range(f):
-                    f_00, f_01, f_10, f_11 = node[a, b], node[a, b + 1], node[a + 1, b], node[a + 1, b + 1]
-                    mark = node_seen[a, b]
-                    same = (
-                        mark == node_seen[a + 1, b] and mark == node_seen[a, b + 1] and mark == node_seen[a + 1, b + 1]
-                    )
-                    if same and mark == 0:
-                        out[0, j * f + a, i * f + b] += weight
-                        continue
-                    M[:] = 0.0
-                    corners = (f_00 + f_01 + f_10 + f_11) / 4
-                    middle, _ = at(c, work, left + (b + 0.5) * h, low + (a + 0.5) * h)
-                    span = max(f_00, f_01, f_10, f_11, middle) - min(f_00, f_01, f_10, f_11, middle)
-                    if span < FLAT or (same and abs(middle - corners) < FLAT):
-                        add(
-                            out,
-                            j * f + a,
-                            i * f + b,
-                            weight * (2 * middle + corners) / 3,
-                            weight * f * (f_01 + f_11 - f_00 - f_10) / 2,
-                            weight * f * (f_10 + f_11 - f_00 - f_01) / 2,
-                            weight * f * f * (f_11 - f_10 - f_01 + f_00),
-                            0.0,
-                            0.0,
-                        )
-                        continue
-                    if span > 24 * FLAT:
-                        m_00, m_01 = node_seen[a, b], node_seen[a, b + 1]
-                        m_10, m_11 = node_seen[a + 1, b], node_seen[a + 1, b + 1]
-                        sides_u = int(m_00 != m_01) + int(m_10 != m_11)
-                        sides_v = int(m_00 != m_10) + int(m_01 != m_11)
-                        along_u = abs(f_01 + f_11 - f_00 - f_10) > abs(f_10 + f_11 - f_00 - f_01)
-                        if sides_u != sides_v:
-                            along_u = sides_u > sides_v
-                        marks = (m_00, m_01, m_10, m_11) if along_u else (m_00, m_10, m_01, m_11)
-                        _split_cell(c, work, left + b * h, low + a * h, h, along_u, marks, M)
-                        add_moments(out, j * f + a, i * f + b, weight, f, M, 0.0, 1 / 12)
-                        continue
-                    points = LATTICE_13 if span > 6 * FLAT else LATTICE_5
-                    n = len(points)
-                    for q in range(n):
-                        x, y = points[q]
-                        value, _ = at(c, work, left + (b + x + 0.5) * h, low + (a + y + 0.5) * h)
-                        gather_value(M, value / n, x, y)
-                    xy = (points[:, 0] * points[:, 1]).mean()
-                    add_moments(out, j * f + a, i * f + b, weight, f, M, xy, (1 - 1 / n**2) / 12)
+        _nodes(c, work, I, seen, j, i, f, left, low, node, node_seen)
+        for cell in range(f * f):
+            a, b = cell // f, cell % f
+            corners, marks = node[a : a + 2, b : b + 2], node_seen[a : a + 2, b : b + 2]
+            _cell(c, work, corners, marks, f, left + b * h, low + a * h, j * f + a, i * f + b, weight, out, M)
 
 
 def _without_small_parts(compiled: Compiled, boxes: Array) -> bool:
@@ -219,7 +258,7 @@ def add_transmission(
     T_FW: each frame's transform to W.  Raises InputError where a ray crosses more surfaces than `LARGEST`.
     """
     c = kernel_scene(compiled, beam, view, T_FW)
-    boxes = c[-1]
+    boxes = c.boxes
     I = np.empty((window.n_v + 1, window.n_u + 1))
     seen = np.empty(I.shape, dtype=np.int64)
     mask = np.zeros(I.shape, dtype=np.bool_)

@@ -6,7 +6,7 @@ each of their cells is sampled on a Fibonacci lattice, the finer the steeper the
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -31,7 +31,7 @@ from tomopose.simulation.projector.cells import (
 )
 from tomopose.simulation.projector.raster import fill, gather, projected, sample, touching
 from tomopose.simulation.projector.rays import LARGEST, Compiled
-from tomopose.simulation.projector.sampling import kernel_scene, lengths, work_space
+from tomopose.simulation.projector.sampling import KernelScene, WorkSpace, kernel_scene, lengths, work_space
 from tomopose.simulation.projector.view import Arrays, View, Window, in_bands
 
 FLAT, STEEP, STEEPEST = 2e-3, 2e-2, 0.1
@@ -40,30 +40,29 @@ on the second and the third lattice are used."""
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _reach(c: Arrays, u: float, v: float) -> float:
+def _reach(c: KernelScene, u: float, v: float) -> float:
     """Length (mm) of u U + v V + O - s: what one unit of q is worth."""
-    s, O, U, V = c[10], c[11], c[12], c[13]
-    x = O[0] + u * U[0] + v * V[0] - s[0]
-    y = O[1] + u * U[1] + v * V[1] - s[1]
-    z = O[2] + u * U[2] + v * V[2] - s[2]
+    x = c.O[0] + u * c.U[0] + v * c.V[0] - c.s[0]
+    y = c.O[1] + u * c.U[1] + v * c.V[1] - c.s[1]
+    z = c.O[2] + u * c.U[2] + v * c.V[2] - c.s[2]
     return float(np.sqrt(x * x + y * y + z * z))
 
 
 @njit(cache=True, nogil=True)
-def _transmission(c: Arrays, work: Arrays, Q: np.ndarray, L: np.ndarray, u: float, v: float) -> Any:
+def _transmission(c: KernelScene, work: WorkSpace, Q: np.ndarray, L: np.ndarray, u: float, v: float) -> Any:
     """(transmission, signature of the solids) of a ray that has the signed q sums Q (m,) in the meshes."""
     signature = lengths(c, work, u, v)
     if signature == 0 and not Q.any():
         return 1.0, signature
     d = _reach(c, u, v)
     for m in range(len(Q)):
-        L[m] = work[2][m] + max(Q[m], 0.0) * d
-    return attenuated(c[9], L), signature
+        L[m] = work.L[m] + max(Q[m], 0.0) * d
+    return attenuated(c.beam, L), signature
 
 
 @njit(cache=True, nogil=True)
 def _corners(
-    c: Arrays,
+    c: KernelScene,
     depth: int,
     P: Arrays,
     u_0: float,
@@ -86,18 +85,53 @@ def _corners(
     return True
 
 
+class Touched(NamedTuple):
+    """The triangles that touch each rough pixel: lists[start[j, i]] and the next count[j, i] - 1; see `touching`."""
+
+    rough: np.ndarray
+    start: np.ndarray
+    count: np.ndarray
+    lists: np.ndarray
+
+
+class Gathered(NamedTuple):
+    """What `sample` needs of one pixel's triangles, and the sign of the projection."""
+
+    edges: np.ndarray
+    planes: np.ndarray
+    columns: np.ndarray
+    sign: float
+
+
+@njit(cache=True, nogil=True)
+def _ray(
+    c: KernelScene,
+    work: WorkSpace,
+    k: int,
+    near: Gathered,
+    Q: np.ndarray,
+    L: np.ndarray,
+    x: float,
+    y: float,
+    u_0: float,
+    v_0: float,
+) -> float:
+    """Transmission at the sample (x, y) of the grid, through the k gathered triangles and the solids."""
+    Q[:] = 0.0
+    sample(k, near.edges, near.planes, near.columns, near.sign, x, y, Q)
+    value, _ = _transmission(c, work, Q, L, u_0 + x, v_0 + y)
+    return float(value)
+
+
 @njit(cache=True, nogil=True)
 def _rough_cells(
-    c: Arrays,
+    c: KernelScene,
     depth: int,
     P: Arrays,
     u_0: float,
     v_0: float,
     I: np.ndarray,
-    rough: np.ndarray,
-    start: np.ndarray,
-    count: np.ndarray,
-    lists: np.ndarray,
+    touched: Touched,
     f: int,
     weight: float,
     j_0: int,
@@ -107,44 +141,36 @@ def _rough_cells(
     """Add weight x moments of the cells of rough pixels in rows j_0 to j_1 to `out`."""
     work, h = work_space(c, depth), 1.0 / f
     bow = bows(f)
-    Q, L, M = np.empty(len(work[2])), np.empty(len(work[2])), np.empty(HELD)
+    Q, L, M = np.empty(len(work.L)), np.empty(len(work.L)), np.empty(HELD)
     most = 1
     for j in range(j_0, j_1):
-        for i in range(rough.shape[1]):
-            most = max(most, count[j, i])
-    edges, planes, columns = np.empty((most, 3, 6)), np.empty((most, 11)), np.empty(most, dtype=np.int64)
-    for j in range(j_0, j_1):
-        for i in range(rough.shape[1]):
-            if not rough[j, i]:
-                continue
-            k = count[j, i]
-            gather(P, lists[start[j, i] : start[j, i] + k], edges, planes, columns)
-            f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
-            off, bump = 0.0, 0.0
-            for q in range(5):
-                x, y = LATTICE_5[q, 0] + 0.5, LATTICE_5[q, 1] + 0.5
-                Q[:] = 0.0
-                sample(k, edges, planes, columns, P[6], i + x, j + y, Q)
-                value, _ = _transmission(c, work, Q, L, u_0 + i + x, v_0 + j + y)
-                value -= (1 - y) * ((1 - x) * f_00 + x * f_01) + y * ((1 - x) * f_10 + x * f_11)
-                off, bump = max(off, abs(value)), bump + value / 5
-            if off < FLAT:
-                # The mean of x (1 - x) / 2 is 1 / 12.
-                fill_pixel(out, j, i, f, weight, bow, f_00, f_01, f_10, f_11, -6 * bump, -6 * bump)
-                continue
-            points = LATTICE_13 if off < STEEP else LATTICE_55 if off < STEEPEST else LATTICE_233
-            n, xy = len(points), (points[:, 0] * points[:, 1]).mean()
-            for a in range(f):
-                for b in range(f):
-                    M[:] = 0.0
-                    for q in range(n):
-                        x, y = points[q]
-                        Q[:] = 0.0
-                        x_q, y_q = i + (b + x + 0.5) * h, j + (a + y + 0.5) * h
-                        sample(k, edges, planes, columns, P[6], x_q, y_q, Q)
-                        value, _ = _transmission(c, work, Q, L, u_0 + x_q, v_0 + y_q)
-                        gather_value(M, value / n, x, y)
-                    add_moments(out, j * f + a, i * f + b, weight, f, M, xy, (1 - 1 / n**2) / 12)
+        most = max(most, touched.count[j].max())
+    near = Gathered(np.empty((most, 3, 6)), np.empty((most, 11)), np.empty(most, dtype=np.int64), P[6])
+    for j, i in np.argwhere(touched.rough[j_0:j_1]):
+        j += j_0
+        k, first = touched.count[j, i], touched.start[j, i]
+        gather(P, touched.lists[first : first + k], near.edges, near.planes, near.columns)
+        f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
+        off, bump = 0.0, 0.0
+        for q in range(5):
+            x, y = LATTICE_5[q, 0] + 0.5, LATTICE_5[q, 1] + 0.5
+            value = _ray(c, work, k, near, Q, L, i + x, j + y, u_0, v_0)
+            value -= (1 - y) * ((1 - x) * f_00 + x * f_01) + y * ((1 - x) * f_10 + x * f_11)
+            off, bump = max(off, abs(value)), bump + value / 5
+        if off < FLAT:
+            # The mean of x (1 - x) / 2 is 1 / 12.
+            fill_pixel(out, j, i, f, weight, bow, f_00, f_01, f_10, f_11, -6 * bump, -6 * bump)
+            continue
+        points = LATTICE_13 if off < STEEP else LATTICE_55 if off < STEEPEST else LATTICE_233
+        n, xy = len(points), (points[:, 0] * points[:, 1]).mean()
+        for cell in range(f * f):
+            a, b = cell // f, cell % f
+            M[:] = 0.0
+            for q in range(n):
+                x, y = points[q]
+                value = _ray(c, work, k, near, Q, L, i + (b + x + 0.5) * h, j + (a + y + 0.5) * h, u_0, v_0)
+                gather_value(M, value / n, x, y)
+            add_moments(out, j * f + a, i * f + b, weight, f, M, xy, (1 - 1 / n**2) / 12)
 
 
 def add_mesh_transmission(
@@ -190,8 +216,9 @@ def add_mesh_transmission(
     lists = np.empty(int(count.sum()), dtype=np.int64)
     count[:] = 0
     in_bands(lambda lo, hi: touching(P, rough, lo, hi, count, start, lists), n_v, threads)
+    touched = Touched(rough=rough, start=start, count=count, lists=lists)
     in_bands(
-        lambda lo, hi: _rough_cells(c, depth, P, u_0, v_0, I, rough, start, count, lists, f, weight, lo, hi, out),
+        lambda lo, hi: _rough_cells(c, depth, P, u_0, v_0, I, touched, f, weight, lo, hi, out),
         n_v,
         threads,
     )

@@ -106,6 +106,30 @@ def _plane(x: np.ndarray, y: np.ndarray, h: np.ndarray, a: int, b: int, c: int) 
     return h[a], h_x, h_y, min(h[a], h[b], h[c]), max(h[a], h[b], h[c])
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _sides(edges: Arrays, j: int) -> Any:
+    """x of the rising and of the falling edge of a triangle on the line y = j that crosses both."""
+    up = down = 0.0
+    for e in edges:
+        if e[0] <= j < e[1]:
+            at = e[3] + (j - e[2]) * e[4]
+            up, down = (at, down) if e[5] > 0 else (up, at)
+    return up, down
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _reach_in_row(edges: Arrays, j: int) -> Any:
+    """(least, largest) x of a triangle's edges between the lines y = j and j + 1; (inf, -inf) where there are none."""
+    left, right = np.inf, -np.inf
+    for e in edges:
+        # The ends of a level edge belong to the other two.
+        if e[1] >= j and e[0] <= j + 1 and e[1] != e[0]:
+            at_0 = e[3] + (max(e[0], min(e[1], float(j))) - e[2]) * e[4]
+            at_1 = e[3] + (max(e[0], min(e[1], float(j + 1))) - e[2]) * e[4]
+            left, right = min(left, at_0, at_1), max(right, at_0, at_1)
+    return left, right
+
+
 @njit(cache=True, nogil=True)
 def fill(P: Arrays, j_0: int, j_1: int, Q: np.ndarray, seen: np.ndarray) -> None:
     """Signed sums of q (rows, columns, materials) and signatures of the grid's samples (i, j), rows j_0 to j_1."""
@@ -121,14 +145,7 @@ def fill(P: Arrays, j_0: int, j_1: int, Q: np.ndarray, seen: np.ndarray) -> None
         edges = (_edge(x, y, a, b), _edge(x, y, b, c), _edge(x, y, c, a))
         m, s = column[t], mark[t]
         for j in range(first, last):
-            up = down = 0.0
-            for e in edges:
-                if e[0] <= j < e[1]:
-                    at = e[3] + (j - e[2]) * e[4]
-                    if e[5] > 0:
-                        up = at
-                    else:
-                        down = at
+            up, down = _sides(edges, j)
             left, right, way = (up, down, -sign) if up < down else (down, up, sign)
             here = h_a + (j - y[a]) * h_y
             for i in range(int(np.ceil(held(left, 0, n_u))), int(np.ceil(held(right, 0, n_u)))):
@@ -154,22 +171,15 @@ def touching(
             continue
         edges = (_edge(x, y, a, b), _edge(x, y, b, c), _edge(x, y, c, a))
         for j in range(first, last):
-            left, right = np.inf, -np.inf
-            for e in edges:
-                if e[1] >= j and e[0] <= j + 1:
-                    if e[1] == e[0]:
-                        # A level edge: its ends belong to the other two.
-                        continue
-                    at_0 = e[3] + (max(e[0], min(e[1], float(j))) - e[2]) * e[4]
-                    at_1 = e[3] + (max(e[0], min(e[1], float(j + 1))) - e[2]) * e[4]
-                    left, right = min(left, at_0, at_1), max(right, at_0, at_1)
+            left, right = _reach_in_row(edges, j)
             if right < left:
                 left, right = min(x[a], x[b], x[c]), max(x[a], x[b], x[c])
             for i in range(int(held(np.floor(left), 0, n_u)), int(held(np.floor(right) + 1, 0, n_u))):
-                if wanted[j, i]:
-                    if len(lists):
-                        lists[start[j, i] + count[j, i]] = t
-                    count[j, i] += 1
+                if not wanted[j, i]:
+                    continue
+                if len(lists):
+                    lists[start[j, i] + count[j, i]] = t
+                count[j, i] += 1
 
 
 @njit(cache=True, nogil=True)

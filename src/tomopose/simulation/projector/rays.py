@@ -10,7 +10,7 @@ large ones: the error of a path stays below 1 nm even at grazing incidence.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -28,6 +28,20 @@ BUNDLE = 32
 """Rays that are looked at together, to find which solids they can meet at all."""
 LARGEST = 48
 """Most surface crossings on one ray inside one solid; a ray that needs more is an error, never a wrong path."""
+
+
+class SolidArrays(NamedTuple):
+    """The arrays of `Compiled`, in one frame, as numba takes them."""
+
+    kind: np.ndarray
+    p: Array
+    R: Array
+    t: Array
+    ops: np.ndarray
+    first: np.ndarray
+    material: np.ndarray
+    centre: Array
+    radius: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,10 +66,18 @@ class Compiled:
     centre: Array
     radius: Array
     frame: tuple[Frame, ...]
-    solid: Any
+    solid: np.ndarray
     corners: tuple[Array, ...]
     smallest: float
     depth: int
+
+    def arrays(self, T_FW: dict[Frame, RigidTransform] | None) -> SolidArrays:
+        """What the kernels take, in W, or in the frame that all solids share where T_FW is None."""
+        R, t, centre = (self.R, self.t, self.centre) if T_FW is None else self.in_world(T_FW)
+        return SolidArrays(
+            kind=self.kind, p=self.p, R=R, t=t, ops=self.ops, first=self.first, material=self.material, centre=centre,
+            radius=self.radius,
+        )  # fmt: skip
 
     def in_world(self, T_FW: dict[Frame, RigidTransform]) -> tuple[Array, Array, Array]:
         """(R, t, centre) of primitives and bounding spheres in W, for one pose's frame-to-world transforms."""
@@ -145,16 +167,58 @@ def _combine(T: np.ndarray, S: np.ndarray, a: int, na: int, b: int, nb: int, op:
 
 
 @njit(cache=True, nogil=True)
+def _solid_crossings(
+    s: SolidArrays,
+    k: int,
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    T: np.ndarray,
+    S: np.ndarray,
+) -> int:
+    """Crossings of solid k, by its postfix program, into row 0 of T and S; their number, -1 where a list overflowed."""
+    spare = T.shape[0] - 1
+    top = n_now = 0
+    for q in range(s.first[k], s.first[k + 1]):
+        op = s.ops[q]
+        if op >= 0:
+            n_now = crossings(s.kind, s.p, s.R, s.t, op, ox, oy, oz, dx, dy, dz, T, S, top)
+            S[top, LARGEST] = n_now
+            top += 1
+            continue
+        top -= 1
+        n_a, n_b = S[top - 1, LARGEST], S[top, LARGEST]
+        n_now = n_a
+        if n_b == 0:
+            if op == -2:
+                n_now = 0
+        elif n_a == 0:
+            if op == -1:
+                n_now = n_b
+                T[top - 1, :n_b], S[top - 1, :n_b] = T[top, :n_b], S[top, :n_b]
+        else:
+            n_now = _combine(T, S, top - 1, n_a, top, n_b, op, spare)
+            if n_now < 0:
+                return -1
+            T[top - 1, :n_now], S[top - 1, :n_now] = T[spare, :n_now], S[spare, :n_now]
+        S[top - 1, LARGEST] = n_now
+    return n_now
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _misses(s: SolidArrays, k: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> bool:
+    """Whether a ray passes the bounding sphere of solid k."""
+    ex, ey, ez = s.centre[k, 0] - ox, s.centre[k, 1] - oy, s.centre[k, 2] - oz
+    along = ex * dx + ey * dy + ez * dz
+    return ex * ex + ey * ey + ez * ez - along * along >= s.radius[k] * s.radius[k] * (1 + 1e-9) + 1e-9
+
+
+@njit(cache=True, nogil=True)
 def trace(
-    kind: np.ndarray,
-    p: np.ndarray,
-    R: np.ndarray,
-    c: np.ndarray,
-    ops: np.ndarray,
-    first: np.ndarray,
-    material: np.ndarray,
-    centre: np.ndarray,
-    radius: np.ndarray,
+    s: SolidArrays,
     active: np.ndarray,
     ox: float,
     oy: float,
@@ -169,9 +233,8 @@ def trace(
     """Path lengths of one ray, per material, into L (mm); returns the ray's signature, or -1 where a list overflowed.
 
     active (m,): which solids can be met at all.  o, d: origin and unit direction.  T (depth + 3, LARGEST), S (the
-        same, one column more) int64: work space.  The
-    signature numbers the surfaces crossed in their order: rays that share it are joined by a smooth change of path.
-    S's last corner then holds how many solids were met.
+    same, one column more) int64: work space.  The signature numbers the surfaces crossed in their order: rays that
+    share it are joined by a smooth change of path.  S's last corner then holds how many solids were met.
     """
     for m in range(len(L)):
         L[m] = 0.0
@@ -180,39 +243,12 @@ def trace(
     met = 0
     taken, other, n_taken = T.shape[0] - 2, T.shape[0] - 3, 0
     # Later solids displace earlier ones: walk backwards and keep what is taken already.
-    for k in range(len(first) - 2, -1, -1):
-        if not active[k]:
+    for k in range(len(s.first) - 2, -1, -1):
+        if not active[k] or _misses(s, k, ox, oy, oz, dx, dy, dz):
             continue
-        ex, ey, ez = centre[k, 0] - ox, centre[k, 1] - oy, centre[k, 2] - oz
-        along = ex * dx + ey * dy + ez * dz
-        if ex * ex + ey * ey + ez * ez - along * along >= radius[k] * radius[k] * (1 + 1e-9) + 1e-9:
-            continue
-        top = n_now = 0
-        for q in range(first[k], first[k + 1]):
-            op = ops[q]
-            if op >= 0:
-                n_now = crossings(kind, p, R, c, op, ox, oy, oz, dx, dy, dz, T, S, top)
-                S[top, LARGEST] = n_now
-                top += 1
-                continue
-            top -= 1
-            n_a, n_b = S[top - 1, LARGEST], S[top, LARGEST]
-            n_now = n_a
-            if n_b == 0:
-                if op == -2:
-                    n_now = 0
-            elif n_a == 0:
-                if op == -1:
-                    n_now = n_b
-                    for e in range(n_b):
-                        T[top - 1, e], S[top - 1, e] = T[top, e], S[top, e]
-            else:
-                n_now = _combine(T, S, top - 1, n_a, top, n_b, op, spare)
-                if n_now < 0:
-                    return np.int64(-1)
-                for e in range(n_now):
-                    T[top - 1, e], S[top - 1, e] = T[spare, e], S[spare, e]
-            S[top - 1, LARGEST] = n_now
+        n_now = _solid_crossings(s, k, ox, oy, oz, dx, dy, dz, T, S)
+        if n_now < 0:
+            return np.int64(-1)
         if n_now == 0:
             continue
         met += 1
@@ -226,7 +262,7 @@ def trace(
             path += max(T[row, e + 1], 0.0) - max(T[row, e], 0.0)
         for e in range(n_row):
             signature = (signature * np.int64(1000003) + S[row, e] + 1) & np.int64(0x7FFFFFFFFFFF)
-        L[material[k]] += path
+        L[s.material[k]] += path
         if k > 0:
             n_taken = _combine(T, S, 0, n_now, taken, n_taken, -1, other)
             if n_taken < 0:
@@ -264,53 +300,14 @@ def _meet(centre: np.ndarray, radius: np.ndarray, o: np.ndarray, d: np.ndarray, 
 
 
 @njit(cache=True, nogil=True)
-def _trace_all(
-    kind: np.ndarray,
-    p: np.ndarray,
-    R: np.ndarray,
-    c: np.ndarray,
-    ops: np.ndarray,
-    first: np.ndarray,
-    material: np.ndarray,
-    centre: np.ndarray,
-    radius: np.ndarray,
-    o: np.ndarray,
-    d: np.ndarray,
-    depth: int,
-    lo: int,
-    hi: int,
-    L: np.ndarray,
-) -> int:
+def _trace_all(s: SolidArrays, o: np.ndarray, d: np.ndarray, depth: int, lo: int, hi: int, L: np.ndarray) -> int:
     """Path lengths of rays lo to hi into L; returns the number of a ray whose list overflowed, or -1."""
     T, S = np.empty((depth + 3, LARGEST)), np.empty((depth + 3, LARGEST + 1), dtype=np.int64)
-    active = np.ones(len(material), dtype=np.bool_)
+    active = np.ones(len(s.material), dtype=np.bool_)
     for i in range(lo, hi):
         if (i - lo) % BUNDLE == 0:
-            _meet(centre, radius, o[i : min(i + BUNDLE, hi)], d[i : min(i + BUNDLE, hi)], active)
-        if (
-            trace(
-                kind,
-                p,
-                R,
-                c,
-                ops,
-                first,
-                material,
-                centre,
-                radius,
-                active,
-                o[i, 0],
-                o[i, 1],
-                o[i, 2],
-                d[i, 0],
-                d[i, 1],
-                d[i, 2],
-                T,
-                S,
-                L[i],
-            )
-            < 0
-        ):
+            _meet(s.centre, s.radius, o[i : min(i + BUNDLE, hi)], d[i : min(i + BUNDLE, hi)], active)
+        if trace(s, active, o[i, 0], o[i, 1], o[i, 2], d[i, 0], d[i, 1], d[i, 2], T, S, L[i]) < 0:
             return i
     return -1
 
@@ -330,16 +327,15 @@ def path_lengths(
     neighbours in space are traced faster.
     """
     compiled = solids if isinstance(solids, Compiled) else compile_solids(solids)
-    R, t, centre = (compiled.R, compiled.t, compiled.centre) if T_FW is None else compiled.in_world(T_FW)
+    solid_arrays = compiled.arrays(T_FW)
     d = np.atleast_2d(np.asarray(d, dtype=np.float64))
     d = np.ascontiguousarray(d / np.sqrt(np.einsum("ij,ij->i", d, d))[:, None])
     o = np.broadcast_to(np.asarray(o, dtype=np.float64), d.shape)
     L = np.zeros((len(d), len(compiled.materials)))
-    scene = (compiled.kind, compiled.p, R, t, compiled.ops, compiled.first, compiled.material, centre, compiled.radius)
     bad = [-1]
 
     def some(lo: int, hi: int) -> None:
-        found = _trace_all(*scene, o, d, compiled.depth, lo, hi, L)
+        found = _trace_all(solid_arrays, o, d, compiled.depth, lo, hi, L)
         if found >= 0:
             bad[0] = found
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -11,8 +11,9 @@ from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.simulation.physics.attenuation import attenuated
 from tomopose.simulation.physics.spectrum import Beam
-from tomopose.simulation.projector.rays import LARGEST, Compiled, trace
+from tomopose.simulation.projector.rays import LARGEST, Compiled, SolidArrays, trace
 from tomopose.simulation.projector.view import Arrays, View, shadow_boxes
+from tomopose.units import Array
 
 BLOCK = 4
 """Between every fourth corner rays are interpolated where all around sees the same, smoothly."""
@@ -20,67 +21,92 @@ EVEN = 5e-4
 """Largest third difference of transmission over coarse corners that counts as smooth."""
 
 
-def kernel_scene(compiled: Compiled | None, beam: Beam, view: View, T_FW: dict[Frame, RigidTransform]) -> Any:
-    """What the kernels take of a scene's solids (or of none), its beam and its view; boxes of shadows come last."""
-    parts: tuple[Any, ...]
+class KernelScene(NamedTuple):
+    """What the kernels take of a scene's solids (or of none), its beam and its view: source s (3,), pixel (0, 0) at O,
+    steps U and V, all in W, mm; boxes (m, 2, 2): shadows of the solids on the panel, px."""
+
+    solids: SolidArrays
+    beam: Arrays
+    s: Array
+    O: Array
+    U: Array
+    V: Array
+    boxes: Array
+
+
+class WorkSpace(NamedTuple):
+    """Work space of `trace`: each band of rows has its own.  L (m,): path lengths of the last ray, per material."""
+
+    T: np.ndarray
+    S: np.ndarray
+    L: np.ndarray
+    active: np.ndarray
+
+
+NO_SOLIDS = SolidArrays(
+    kind=np.empty(0, dtype=np.int64), p=np.empty((0, 3)), R=np.empty((0, 3, 3)), t=np.empty((0, 3)),
+    ops=np.empty(0, dtype=np.int64), first=np.zeros(1, dtype=np.int64), material=np.empty(0, dtype=np.int64),
+    centre=np.empty((0, 3)), radius=np.empty(0),
+)  # fmt: skip
+
+
+def kernel_scene(compiled: Compiled | None, beam: Beam, view: View, T_FW: dict[Frame, RigidTransform]) -> KernelScene:
+    """The kernels' values of one frame; T_FW: each frame's transform to W."""
     if compiled is None:
-        none = np.empty(0, dtype=np.int64)
-        parts = (none, np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)), none, np.zeros(1, dtype=np.int64))
-        parts += (none, np.empty((0, 3)), np.empty(0))
-        boxes = np.empty((0, 2, 2))
+        solids, boxes = NO_SOLIDS, np.empty((0, 2, 2))
     else:
-        R, t, centre = compiled.in_world(T_FW)
-        parts = (compiled.kind, compiled.p, R, t, compiled.ops, compiled.first, compiled.material, centre)
-        parts += (compiled.radius,)
+        solids = compiled.arrays(T_FW)
         boxes = shadow_boxes(list(zip(compiled.frame, compiled.corners, strict=True)), view, T_FW)
-    return (*parts, beam.arrays, view.source, view.O, view.U, view.V, boxes)
+    return KernelScene(solids=solids, beam=beam.arrays, s=view.source, O=view.O, U=view.U, V=view.V, boxes=boxes)
 
 
 @njit(cache=True, nogil=True)
-def work_space(c: Arrays, depth: int) -> Any:
-    """(T, S, L, active) for `trace`: each band of rows has its own."""
-    mu, boxes = c[9][1], c[14]
-    return (
+def work_space(c: KernelScene, depth: int) -> WorkSpace:
+    """Work space for solids whose programs need that depth."""
+    return WorkSpace(
         np.empty((depth + 3, LARGEST)),
         np.empty((depth + 3, LARGEST + 1), dtype=np.int64),
-        np.empty(mu.shape[1]),
-        np.empty(len(boxes), dtype=np.bool_),
+        np.empty(c.beam[1].shape[1]),
+        np.empty(len(c.boxes), dtype=np.bool_),
     )
 
 
 @njit(cache=True, nogil=True)
-def lengths(c: Arrays, work: Arrays, u: float, v: float) -> Any:
-    """The signature of the ray through pixel coordinates (u, v); its path lengths are in work[2]."""
-    kind, p, R, t, ops, first, material, centre, radius, _, s, O, U, V, boxes = c
-    T, S, L, active = work
+def lengths(c: KernelScene, work: WorkSpace, u: float, v: float) -> Any:
+    """The signature of the ray through pixel coordinates (u, v); its path lengths are in work.L."""
     nothing = True
-    for k in range(len(active)):
-        active[k] = boxes[k, 0, 0] <= u <= boxes[k, 1, 0] and boxes[k, 0, 1] <= v <= boxes[k, 1, 1]
-        nothing = nothing and not active[k]
+    for k in range(len(work.active)):
+        box = c.boxes[k]
+        work.active[k] = box[0, 0] <= u <= box[1, 0] and box[0, 1] <= v <= box[1, 1]
+        nothing = nothing and not work.active[k]
     if nothing:
-        L[:] = 0.0
+        work.L[:] = 0.0
         return np.int64(0)
-    dx, dy, dz = (
-        O[0] + u * U[0] + v * V[0] - s[0],
-        O[1] + u * U[1] + v * V[1] - s[1],
-        O[2] + u * U[2] + v * V[2] - s[2],
-    )
+    dx = c.O[0] + u * c.U[0] + v * c.V[0] - c.s[0]
+    dy = c.O[1] + u * c.U[1] + v * c.V[1] - c.s[1]
+    dz = c.O[2] + u * c.U[2] + v * c.V[2] - c.s[2]
     h = 1 / np.sqrt(dx * dx + dy * dy + dz * dz)
-    return trace(
-        kind, p, R, t, ops, first, material, centre, radius, active, s[0], s[1], s[2], h * dx, h * dy, h * dz, T, S, L
-    )
+    return trace(c.solids, work.active, c.s[0], c.s[1], c.s[2], h * dx, h * dy, h * dz, work.T, work.S, work.L)
 
 
 @njit(cache=True, nogil=True)
-def at(c: Arrays, work: Arrays, u: float, v: float) -> Any:
+def at(c: KernelScene, work: WorkSpace, u: float, v: float) -> Any:
     """(transmission, signature) at pixel coordinates (u, v)."""
     signature = lengths(c, work, u, v)
-    return 1.0 if signature == 0 else attenuated(c[9], work[2]), signature
+    return 1.0 if signature == 0 else attenuated(c.beam, work.L), signature
 
 
 @njit(cache=True, nogil=True)
 def coarse_corners(
-    c: Arrays, depth: int, u_0: int, v_0: int, mask: np.ndarray, j_0: int, j_1: int, I: np.ndarray, seen: np.ndarray
+    c: KernelScene,
+    depth: int,
+    u_0: int,
+    v_0: int,
+    mask: np.ndarray,
+    j_0: int,
+    j_1: int,
+    I: np.ndarray,
+    seen: np.ndarray,
 ) -> None:
     """Every BLOCK-th corner, rows j_0 to j_1 of them; seen is 0 where nothing is met, or less than may be met."""
     work = work_space(c, depth)
@@ -89,10 +115,7 @@ def coarse_corners(
             I[j, i], seen[j, i] = 1.0, 0
             if mask[BLOCK * j, BLOCK * i]:
                 I[j, i], seen[j, i] = at(c, work, u_0 + BLOCK * i - 0.5, v_0 + BLOCK * j - 0.5)
-                possible = 0
-                for k in range(len(work[3])):
-                    possible += work[3][k]
-                if possible != work[1][-1, -1]:
+                if work.active.sum() != work.S[-1, -1]:
                     seen[j, i] = 0
 
 
@@ -113,9 +136,30 @@ def _even(I: np.ndarray, seen: np.ndarray, j: int, i: int) -> bool:
     return largest <= EVEN
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _cubic(x: float) -> Any:
+    """Weights of four samples at -1, 0, 1, 2 by which a cubic through them gives the value at x."""
+    return (
+        -x * (x - 1) * (x - 2) / 6,
+        (x + 1) * (x - 1) * (x - 2) / 2,
+        -(x + 1) * x * (x - 2) / 2,
+        (x + 1) * x * (x - 1) / 6,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _interpolated(rough: np.ndarray, J: int, K: int, w_y: Arrays, w_x: Arrays) -> float:
+    """The value within coarse corners (J, K) and (J + 1, K + 1) by those weights."""
+    total = 0.0
+    for a in range(4):
+        for b in range(4):
+            total += w_y[a] * w_x[b] * rough[J - 1 + a, K - 1 + b]
+    return total
+
+
 @njit(cache=True, nogil=True)
 def all_corners(
-    c: Arrays,
+    c: KernelScene,
     depth: int,
     u_0: int,
     v_0: int,
@@ -139,28 +183,13 @@ def all_corners(
         if j == j_0 or y == 0:
             for K in range(len(even)):
                 even[K] = rough.shape[0] > 0 and _even(rough, rough_seen, J, K)
-        w_y = (
-            -y * (y - 1) * (y - 2) / 6,
-            (y + 1) * (y - 1) * (y - 2) / 2,
-            -(y + 1) * y * (y - 2) / 2,
-            (y + 1) * y * (y - 1) / 6,
-        )
+        w_y = _cubic(y)
         for i in range(I.shape[1]):
             I[j, i], seen[j, i] = 1.0, 0
             K = i // BLOCK
             if even[K]:
-                x = (i % BLOCK) / BLOCK
-                w_x = (
-                    -x * (x - 1) * (x - 2) / 6,
-                    (x + 1) * (x - 1) * (x - 2) / 2,
-                    -(x + 1) * x * (x - 2) / 2,
-                    (x + 1) * x * (x - 1) / 6,
-                )
-                total = 0.0
-                for a in range(4):
-                    for b in range(4):
-                        total += w_y[a] * w_x[b] * rough[J - 1 + a, K - 1 + b]
-                I[j, i], seen[j, i] = total, rough_seen[J, K]
+                w_x = _cubic((i % BLOCK) / BLOCK)
+                I[j, i], seen[j, i] = _interpolated(rough, J, K, w_y, w_x), rough_seen[J, K]
             elif mask[j, i]:
                 I[j, i], seen[j, i] = at(c, work, u_0 + i - 0.5, v_0 + j - 0.5)
                 if seen[j, i] < 0:

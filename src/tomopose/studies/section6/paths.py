@@ -35,6 +35,32 @@ def ball_paths(P: Array, centres: Array, radii: Array, shaft_radius: float, bott
 
 
 @njit(cache=True, nogil=True)
+def _ball_on_shaft(o: np.ndarray, d: np.ndarray, r: float, shaft: float, bottom: float) -> float:
+    """Path (mm) of the ray o + t d, |d| = 1, through a ball of radius r at the origin and the upright shaft below it
+    that reaches down to z = bottom; what they share counts once."""
+    # Distances from the point nearest to the ball, so that no small number is a difference of large ones.
+    n = o - (o @ d) * d
+    under = r * r - n @ n
+    ball = np.sqrt(under) if under > 0.0 else 0.0
+    path = 2.0 * ball
+    a = d[0] * d[0] + d[1] * d[1]
+    e = n[0] * d[0] + n[1] * d[1]
+    under = e * e - a * (n[0] * n[0] + n[1] * n[1] - shaft * shaft)
+    if under <= 0.0 or a <= 0.0 or bottom >= 0.0:
+        return float(path)
+    root = np.sqrt(under)
+    low, high = (-e - root) / a, (-e + root) / a
+    if d[2] != 0.0:
+        end_1, end_2 = (bottom - n[2]) / d[2], -n[2] / d[2]
+        low, high = max(low, min(end_1, end_2)), min(high, max(end_1, end_2))
+    elif n[2] > 0.0 or n[2] < bottom:
+        high = low
+    if high > low:
+        path += high - low - max(min(high, ball) - max(low, -ball), 0.0)
+    return float(path)
+
+
+@njit(cache=True, nogil=True)
 def _add_balls(
     P: np.ndarray,
     inverse: np.ndarray,
@@ -58,33 +84,10 @@ def _add_balls(
             u = (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3]) / w
             v = (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3]) / w
             u_low, u_high, v_low, v_high = min(u_low, u), max(u_high, u), min(v_low, v), max(v_high, v)
-        o_x, o_y, o_z = s[0] - c[0], s[1] - c[1], s[2] - c[2]
         u_low, u_high = min(max(u_low, 0.0), float(n_u)), min(max(u_high + 2, 0.0), float(n_u))
         v_low, v_high = min(max(v_low, 0.0), float(n_v)), min(max(v_high + 2, 0.0), float(n_v))
         for v in range(int(v_low), int(v_high)):
             for u in range(int(u_low), int(u_high)):
-                d_x = inverse[0, 0] * u + inverse[0, 1] * v + inverse[0, 2]
-                d_y = inverse[1, 0] * u + inverse[1, 1] * v + inverse[1, 2]
-                d_z = inverse[2, 0] * u + inverse[2, 1] * v + inverse[2, 2]
-                length = np.sqrt(d_x * d_x + d_y * d_y + d_z * d_z)
-                d_x, d_y, d_z = d_x / length, d_y / length, d_z / length
-                b = o_x * d_x + o_y * d_y + o_z * d_z
-                # Distances from the point nearest to the ball, so that no small number is a difference of large ones.
-                n_x, n_y, n_z = o_x - b * d_x, o_y - b * d_y, o_z - b * d_z
-                under = r * r - (n_x * n_x + n_y * n_y + n_z * n_z)
-                ball = np.sqrt(under) if under > 0.0 else 0.0
-                path = 2.0 * ball
-                a = d_x * d_x + d_y * d_y
-                e = n_x * d_x + n_y * d_y
-                under = e * e - a * (n_x * n_x + n_y * n_y - shaft * shaft)
-                if under > 0.0 and a > 0.0 and bottom[m] < c[2]:
-                    root = np.sqrt(under)
-                    low, high = (-e - root) / a, (-e + root) / a
-                    if d_z != 0.0:
-                        end_1, end_2 = (bottom[m] - c[2] - n_z) / d_z, -n_z / d_z
-                        low, high = max(low, min(end_1, end_2)), min(high, max(end_1, end_2))
-                    elif n_z > 0.0 or n_z < bottom[m] - c[2]:
-                        high = low
-                    if high > low:
-                        path += high - low - max(min(high, ball) - max(low, -ball), 0.0)
+                d = inverse @ np.array([u, v, 1.0])
+                path = _ball_on_shaft(s - c, d / np.sqrt(d @ d), r, shaft, bottom[m] - c[2])
                 out[v, u] += path
