@@ -40,7 +40,7 @@ GROUPS = {
     "files": ("Tables and files", ("io", "observations", "provenance", "errors")),
     "detection": ("Find the ball", ("detection",)),
     "calibration": ("Calibrate, judge and compare", ("calibration",)),
-    "exports": ("Geometry for other packages", ("exports",)),
+    "exports": ("Geometry for other packages", ("exports", "engines.objects")),
     "planning": ("Plan poses and scans", ("planning",)),
     "reconstruction": ("Reconstruct", ("reconstruction", "engines", "volume")),
     "measurement": ("Measure", ("measurement", "uncertainty")),

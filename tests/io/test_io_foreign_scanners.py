@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 import tomopose as tp
-from tomopose.errors import FileError, InputError, UnitError
+from tomopose.errors import FileError, InputError, InputWarning, UnitError
 
 
 @pytest.fixture
@@ -253,6 +254,15 @@ def test_nxtomo_gives_scanner_and_poses_with_their_units(nexus):
     assert poses.image == ("scan.nxs[1]", "scan.nxs[2]", "scan.nxs[3]")
     images = tp.open_images(nexus)
     assert tp.pair_images(poses, images).tolist() == [0, 1, 2]
+
+
+def test_table_angles_that_the_pose_table_contradicts_are_a_warning(nexus):
+    poses, images = tp.read_pose_log(nexus).poses(), tp.open_images(nexus)
+    tp.pair_images(replace(poses, alpha=0.3 - poses.alpha), images)  # another zero and sense: the same turns
+    with pytest.warns(
+        InputWarning, match=r"turned by 180 deg from the first image to scan\.nxs\[3\], the pose table 0 deg"
+    ):
+        tp.pair_images(replace(poses, alpha=np.zeros(3)), images)
 
 
 def test_a_length_without_unit_is_named_and_not_used(nexus):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tomopose import PoseSequence, RigidTransform, Scanner
-from tomopose.errors import InputError
+from tomopose.errors import FileError, InputError
 from tomopose.geometry.frames import Frame
 from tomopose.simulation.objects.mesh import write_stl
 from tomopose.simulation.objects.shapes import Solid, box, cylinder
@@ -68,3 +68,25 @@ def test_what_is_not_read_is_refused(run, tmp_path):
         run_from_ctsimu({**content, "samples": [], "source": {**content["source"], "voltage": None}})
     with pytest.raises(InputError, match="names no mesh file"):
         run_from_ctsimu({**content, "samples": [{"name": "x"}]})
+
+
+def test_null_parameters_are_not_asked_for_and_a_spectrum_file_is_read(run, tmp_path):
+    content, files = run_to_ctsimu(run)
+    for name, mesh in files.items():
+        write_stl(tmp_path / name, mesh)
+    source, detector = content["source"], content["detector"]
+    source["spectrum"] = {"monochromatic": False, "file": {"value": "tube.csv"}}
+    source["spot"]["intensity_map"] = {"file": {"value": None}, "dim_x": None, "type": "uint16"}
+    source["filters"] = []
+    detector["gray_value"]["intensity_characteristics_file"] = {"value": None}
+    detector["bad_pixel_map"] = {"file": {"value": None}}
+    detector["columns"]["unit"] = detector["rows"]["unit"] = "px"
+    (tmp_path / "tube.csv").write_text("# energy photons\n0\t0\n40\t1.0\n60\t3.0\n80\t2.0\n")
+    back = run_from_ctsimu(content, folder=tmp_path)
+    np.testing.assert_array_equal(back.spectrum.energy, [40, 60, 80])
+    (tmp_path / "tube.csv").unlink()
+    with pytest.raises(FileError, match=r"spectrum file .*tube\.csv cannot be read"):
+        run_from_ctsimu(content, folder=tmp_path)
+    source["spot"]["intensity_map"]["file"]["value"] = "spot.raw"
+    with pytest.raises(InputError, match=r"spot\.intensity_map\.file \(spot\.raw\) is not read"):
+        run_from_ctsimu(content, folder=tmp_path)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import PurePath
 
 import numpy as np
 
-from tomopose.errors import InputError
+from tomopose.errors import InputError, InputWarning
 from tomopose.files import natural_key
 from tomopose.io.images.frames import missing_numbers, numbers_in_names
 from tomopose.io.images.sequence import ImageSequence
@@ -16,6 +17,8 @@ from tomopose.manipulator.poses import PoseSequence
 
 Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
 SHOWN = 5
+TABLE_TOLERANCE_RAD = np.radians(0.1)
+"""Turns of the table that differ by more are no positioning error of a rotary table but another column."""
 
 
 def pair_images(poses: PoseSequence, images: ImageSequence | Sequence[str]) -> Indices:
@@ -30,6 +33,34 @@ def pair_images(poses: PoseSequence, images: ImageSequence | Sequence[str]) -> I
     Raises InputError, listing what has no partner.
     """
     names = tuple(images.names if isinstance(images, ImageSequence) else images)
+    found = _paired(poses, names)
+    if isinstance(images, ImageSequence):
+        _warn_if_the_table_differs(poses, images, found)
+    return found
+
+
+def _warn_if_the_table_differs(poses: PoseSequence, images: ImageSequence, found: Indices) -> None:
+    """InputWarning where the images' file states table angles (NXtomo) that the pose table contradicts.
+
+    Zero and sense of the two may differ, so turns from the first image are compared, in either sense.
+    """
+    stated = getattr(images.source, "angles_deg", None)
+    if stated is None or poses.alpha is None or len(found) < 2:
+        return
+    theirs = np.radians([stated[images.index[int(k)]] for k in found])
+    turn, ours = theirs - theirs[0], poses.alpha - poses.alpha[0]
+    off = min((np.abs(np.angle(np.exp(1j * (ours - sense * turn)))) for sense in (1, -1)), key=lambda d: float(d.max()))
+    if off.max() > TABLE_TOLERANCE_RAD:
+        k = int(np.argmax(off))
+        warnings.warn(
+            f"the images' file says that the table turned by {np.degrees(turn[k]):.4g} deg from the first image to "
+            f"{images.names[int(found[k])]}, the pose table {np.degrees(ours[k]):.4g} deg; the pose table's is used",
+            InputWarning,
+            stacklevel=3,
+        )
+
+
+def _paired(poses: PoseSequence, names: tuple[str, ...]) -> Indices:
     if poses.image is not None:
         return _by_name(poses.image, names)
     numbers = numbers_in_names(names)
