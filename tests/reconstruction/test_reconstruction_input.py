@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from reconstruction_phantom import balls, images_of, scan
 
-from tomopose.errors import ConventionError, InputError, OutOfViewError
+from tomopose.engines.cpu import CpuEngine
+from tomopose.errors import ConventionError, EngineFailedError, InputError, OutOfViewError
 from tomopose.reconstruction import Correction, Execution, LineIntegrals, check_consistency, reconstruct, ring_offset
 from tomopose.reconstruction.settings import OF_ALGORITHM, OF_CORRECTION, algorithm_of, with_options
 from tomopose.volume import VoxelGrid
@@ -190,3 +191,37 @@ def test_rings_are_taken_out():
     clean, ringed = attempt().values, attempt(broken).values
     cured = attempt(broken, ring_width=5).values
     assert np.sqrt(((cured - clean) ** 2).mean()) < 0.4 * np.sqrt(((ringed - clean) ** 2).mean())
+
+
+def test_options_of_the_first_version_still_work_and_say_where_they_belong():
+    with pytest.warns(DeprecationWarning, match=r"relaxation=\.\.\.\) belongs to"):
+        found = reconstruct(
+            IMAGES, MATRICES, GRID, images_are="line-integrals", algorithm="sart", relaxation=0.6, memory_gib=4.0
+        )
+    expected = attempt(algorithm="sart", relaxation=0.6)
+    assert np.array_equal(found.values, expected.values)
+    with pytest.raises(TypeError, match="relaxaton"):
+        reconstruct(IMAGES, MATRICES, GRID, images_are="line-integrals", relaxaton=0.6)
+    with (
+        pytest.warns(DeprecationWarning, match="memory_gib"),
+        pytest.raises(InputError, match="memory_gib is given beside"),
+    ):
+        reconstruct(IMAGES, MATRICES, GRID, images_are="line-integrals", execution=Execution(slabs=1), memory_gib=4.0)
+
+
+def test_an_algorithm_has_its_own_options_only():
+    with pytest.raises(InputError, match="fdk has no iterations; it has preview"):
+        attempt(algorithm="fdk", iterations=2)
+    with pytest.raises(InputError, match="fdk, fdk\\+sart, sart, ossart, cgls"):
+        attempt(algorithm="best")
+    with pytest.raises(InputError, match="a name, FDK, SART, OSSART or CGLS"):
+        attempt(algorithm=0.8)
+
+
+def test_the_coarse_check_uses_the_engine_that_reconstructs_and_refuses_nan(monkeypatch):
+    scan_ = LineIntegrals(IMAGES, MATRICES, Correction(images_are="line-integrals"))
+    own, plain = (check_consistency(scan_, GRID, engine="cpu", options=o) for o in ({}, {"kernels": "plain"}))
+    assert abs(own.residual["as given"] - plain.residual["as given"]) < 1e-4
+    monkeypatch.setattr(CpuEngine, "forward", lambda self, state, views: np.full((len(views), 57, 61), np.nan, "f4"))
+    with pytest.raises(EngineFailedError, match="not a number"):
+        check_consistency(scan_, GRID, engine="cpu")

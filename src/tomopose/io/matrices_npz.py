@@ -61,7 +61,8 @@ def read_matrices(path: str | Path) -> ProjectionMatrices:
     """
     path = Path(path)
     content = _load(path)
-    found = SCHEMA.fullmatch(str(content.get("schema", "")))
+    # The names of the arrays are the format; scripts write them without a schema.
+    found = SCHEMA.fullmatch(str(content.get("schema", "tomopose/matrices/1")))
     if not found or found["name"] != "matrices" or int(found["version"]) > 1:
         raise SchemaVersionError(
             f'{path}: schema is {str(content.get("schema"))!r}; this tomopose reads "tomopose/matrices/1"', path=path

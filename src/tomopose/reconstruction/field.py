@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from tomopose.engines import make_engine
-from tomopose.engines.protocol import Engine, Limits, Weight
+from tomopose.engines.protocol import Engine, Weight
 from tomopose.engines.storage import mapped, store, write_layers
 from tomopose.files import atomic_file
 from tomopose.geometry.projection import ProjectionMatrices
@@ -60,7 +60,6 @@ class Field(Protocol):
 
     grid: VoxelGrid
 
-    def limits(self) -> Limits: ...
     def forward(self, views: Sequence[int]) -> np.ndarray: ...
     def sampled(self, views: Sequence[int], stride: int) -> np.ndarray:
         """`forward` at every stride-th pixel of every stride-th row only."""
@@ -98,9 +97,6 @@ class Piece:
         self._inside = None if support is None else self.engine.put(support.astype(np.float32))
         self._sampling: dict[int, Engine] = {}
         self._wider: dict[tuple[int, int], Engine] = {(0, 0): self.engine}
-
-    def limits(self) -> Limits:
-        return self.engine.limits
 
     def forward(self, views: Sequence[int]) -> np.ndarray:
         return self.engine.forward(self.state, views)
@@ -181,9 +177,6 @@ class DiskField:
         if filled:
             piece.put(mapped(self._file(i, self._generation)))
         return piece
-
-    def limits(self) -> Limits:
-        return self._piece(0, filled=False).limits()
 
     def _sum(self, method: str, *arguments: Any, filled: bool = True) -> np.ndarray:
         total = getattr(self._piece(0, filled=filled), method)(*arguments)
@@ -272,10 +265,6 @@ class DaskField:
         for answer in answers[1:]:
             total = total + answer
         return np.asarray(total)
-
-    def limits(self) -> Limits:
-        found: Limits = self._pieces[0].limits().result()
-        return found
 
     def forward(self, views: Sequence[int]) -> np.ndarray:
         return self._sum("forward", views)

@@ -27,12 +27,10 @@ from tomopose.reconstruction.line_integrals import (
     ring_offset,
 )
 from tomopose.reconstruction.settings import (
-    SART,
     Algorithm,
     EarlierOptions,
     Execution,
     algorithm_of,
-    described,
     with_earlier,
 )
 from tomopose.reconstruction.work import Work, solve
@@ -88,37 +86,16 @@ def reconstruct(
     OutOfViewError                            where the grid lies outside the field of view.
     TrajectoryError                           for FDK, alone or as a start, where it is not defined.
     EngineMissingError                        where the engine cannot run here.
-
-    Examples
-    --------
-    >>> volume = reconstruct(images, matrices, grid, images_are="transmission")             # doctest: +SKIP
-    >>> volume = reconstruct(images, matrices, grid, images_are="transmission", algorithm=SART(relaxation=0.6),
-    ...                      execution=Execution(memory_gib=8, scratch="scratch"))           # doctest: +SKIP
     """
     asked, correction, execution = with_earlier(algorithm_of(algorithm), correction, execution, earlier)
-    if consistency not in ("error", "off"):
-        raise InputError(f"consistency is {consistency!r}; 'error' or 'off' is needed")
-    support = require_support(mask, grid)
-    if support is not None and not support.any():
-        raise InputError("the mask holds no voxel")
+    require_known(consistency)
+    support = support_of(mask, grid)
     require_usable(matrices, grid)
     scan = line_integrals_of(images, matrices, images_are, correction)
     require_contrast(scan, sorted({0, len(scan) // 3, len(scan) // 2, len(scan) - 1}))
     probe = make_engine(engine, matrices.select([0]), VoxelGrid(shape=(1, 1, 1), spacing=grid.spacing))
     situation = situation_of(scan, grid)
     choice = choose(asked, situation, scan, probe.limits, probe.name)
-    settings = {
-        **described(choice.algorithm),
-        "engine": probe.name,
-        "mask": support is not None,
-        **scan.correction.described,
-        "choice": choice.words,
-    }
-    notes = [choice.words, *scan_notes(situation, matrices, grid)]
-    if consistency == "error":
-        coarse = require_consistent(scan, grid, engine=probe.name, options=execution.engine_options)
-        settings["coarse_consistency"] = coarse.residual
-        notes += [coarse.message] if coarse.doubtful else []
     work = Work(
         scan=scan,
         grid=grid,
@@ -128,6 +105,10 @@ def reconstruct(
         choice=choice,
         path=situation.path,
     )
+    notes = [choice.words, *scan_notes(situation, matrices, grid)]
+    settings = work.described
+    if consistency == "error":
+        notes += coarse_check(work, execution, settings)
     values, agreement = solve(work, execution, progress)
     return Volume(
         values=values,
@@ -136,10 +117,29 @@ def reconstruct(
         contradicted=agreement.contradicted,
         notes=(*notes, *agreement_notes(agreement, matrices)),
         settings=settings,
-        provenance=provenance(
-            arguments=settings, seed=choice.algorithm.seed if isinstance(choice.algorithm, SART) else None
-        ),
+        provenance=provenance(arguments=settings, seed=work.seed),
     )
+
+
+def require_known(consistency: str) -> None:
+    """InputError for another word than "error" and "off"."""
+    if consistency not in ("error", "off"):
+        raise InputError(f"consistency is {consistency!r}; 'error' or 'off' is needed")
+
+
+def coarse_check(work: Work, execution: Execution, settings: dict[str, object]) -> list[str]:
+    """What the coarse check has to say; its residuals are put into the settings."""
+    coarse = require_consistent(work.scan, work.grid, engine=work.engine, options=execution.engine_options)
+    settings["coarse_consistency"] = coarse.residual
+    return [coarse.message] if coarse.doubtful else []
+
+
+def support_of(mask: npt.NDArray[np.bool_] | None, grid: VoxelGrid) -> npt.NDArray[np.bool_] | None:
+    """The mask, if it is one of the grid's voxels and holds some."""
+    support = require_support(mask, grid)
+    if support is not None and not support.any():
+        raise InputError("the mask holds no voxel")
+    return support
 
 
 def line_integrals_of(

@@ -21,7 +21,7 @@ from tomopose.reconstruction.findings import Agreement, agreement_of
 from tomopose.reconstruction.line_integrals import LineIntegrals
 from tomopose.reconstruction.memory import memory_plan, require_room_for_cgls, sampling_stride
 from tomopose.reconstruction.order import subsets, view_order
-from tomopose.reconstruction.settings import CGLS, FDK, SART, Execution
+from tomopose.reconstruction.settings import CGLS, FDK, SART, Execution, described
 from tomopose.reconstruction.updates import Samples, Subset, Update, cgls, fdk_update, run, sart_update
 from tomopose.volume import VoxelGrid
 
@@ -43,6 +43,22 @@ class Work:
     limits: Limits
     choice: Choice
     path: SourcePath | None
+
+    @property
+    def seed(self) -> int | None:
+        """Of the random order of views; None for algorithms without one."""
+        return self.choice.algorithm.seed if isinstance(self.choice.algorithm, SART) else None
+
+    @property
+    def described(self) -> dict[str, object]:
+        """The settings that a volume and its provenance hold."""
+        return {
+            **described(self.choice.algorithm),
+            "engine": self.engine,
+            "mask": self.support is not None,
+            **self.scan.correction.described,
+            "choice": self.choice.words,
+        }
 
 
 def solve(work: Work, execution: Execution, progress: Progress) -> tuple[np.ndarray, Agreement]:
