@@ -4,6 +4,7 @@ from . import errors as errors
 from .calibration.arrangements.moving_scanner import calibrate_inverse as calibrate_inverse
 from .calibration.arrangements.multi_sphere import BallPose as BallPose
 from .calibration.arrangements.multi_sphere import pose_from_balls as pose_from_balls
+from .calibration.arrangements.twin_diagnosis import diagnose_twin as diagnose_twin
 from .calibration.arrangements.twin_robots import calibrate_twin as calibrate_twin
 from .calibration.arrangements.twin_robots import twin_matrices as twin_matrices
 from .calibration.checks.alternative import Alternative as Alternative

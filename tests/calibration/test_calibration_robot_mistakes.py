@@ -110,7 +110,7 @@ def test_nothing_is_advised_where_no_reading_fits():
     found = diagnose(SCANNER, table("ur", rng.uniform(-1.5, 1.5, (50, 3))), centres())
     assert found.nothing_fits
     assert found.leading == ()
-    assert all(h.sigmas > FITS_SIGMAS for h in found.hypotheses)
+    assert all(h.sigmas > FITS_SIGMAS and not h.fits for h in found.hypotheses)
     assert found.advice[0].startswith("nothing fits")
     assert "to try" not in " ".join(found.advice)
 

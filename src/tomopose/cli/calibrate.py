@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tomopose.cli.common import PosesOption, ScannerOption, SourcePosesOption, arguments, either, names
-from tomopose.cli.options import ObservedOptions, WritingOptions, add_command
+from tomopose.cli.options import ObservedOptions, SpokenOptions, WritingOptions, add_command
 
 if TYPE_CHECKING:
-    from tomopose import BallObservations, Calibration, PoseSequence, Scanner
+    from tomopose import BallObservations, Calibration, PoseSequence, Scanner, TwinRobots
     from tomopose.manipulator.twin_file import TwinDrawing
 
 EPILOG = (
@@ -34,12 +34,11 @@ def register(app: typer.Typer) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(ObservedOptions, WritingOptions):
-    """The options of `tomopose calibrate`."""
+class CalibrationOptions(ObservedOptions, SpokenOptions):
+    """Everything that says what is calibrated and how; `diagnose` takes the same."""
 
     scanner: ScannerOption
     poses: PosesOption
-    out: Annotated[Path, typer.Option("--out", help="Folder for calibration.json, observations.csv, report.html.")]
     ball_diameter: Annotated[
         float | None,
         typer.Option(
@@ -94,6 +93,13 @@ class Options(ObservedOptions, WritingOptions):
         return self.arrangement == "moving-scanner"
 
 
+@dataclass(frozen=True, kw_only=True)
+class Options(CalibrationOptions, WritingOptions):
+    """The options of `tomopose calibrate`."""
+
+    out: Annotated[Path, typer.Option("--out", help="Folder for calibration.json, observations.csv, report.html.")]
+
+
 def scale_bars(texts: list[str] | None) -> dict[tuple[int, int], tuple[float, float]] | None:
     """`0,1=25.0000(0.0005)` as {(0, 1): (25.0, 0.0005)}, mm."""
     bars = {}
@@ -105,7 +111,7 @@ def scale_bars(texts: list[str] | None) -> dict[tuple[int, int], tuple[float, fl
     return bars or None
 
 
-def require_arrangement(o: Options) -> None:
+def require_arrangement(o: CalibrationOptions) -> None:
     """A usage error where the options contradict one another."""
     if o.arrangement not in ARRANGEMENTS:
         raise typer.BadParameter(
@@ -137,7 +143,7 @@ class Inputs:
     twin: TwinDrawing | None
 
 
-def read_inputs(o: Options) -> Inputs:
+def read_inputs(o: CalibrationOptions) -> Inputs:
     """Read every file that the options name, and find the ball where images are given."""
     import tomopose as tp
     from tomopose.cli.job import forward_of, image_source, note_missing_flat, observe, open_for
@@ -165,10 +171,19 @@ def read_inputs(o: Options) -> Inputs:
     )
 
 
+def twin_robots(o: CalibrationOptions, given: Inputs) -> TwinRobots:
+    """Both robots of twin.json, with the table of the source's."""
+    import tomopose as tp
+    from tomopose.cli.job import forward_of
+
+    assert given.twin is not None
+    assert o.source_poses is not None
+    return given.twin.robots(tp.read_poses(o.source_poses, forward=forward_of(given.twin.source)))
+
+
 def solve(o: Options, given: Inputs) -> Calibration:
     """The calibration of the arrangement; where no optimum was reached, what was reached (it is rejected)."""
     import tomopose as tp
-    from tomopose.cli.job import forward_of
     from tomopose.errors import NotConvergedError
 
     scanner, poses, observations = given.scanner, given.poses, given.observations
@@ -176,9 +191,8 @@ def solve(o: Options, given: Inputs) -> Calibration:
         "model": o.model, "free": names(o.free), "fix": names(o.fix), "distances": scale_bars(o.distance),
     }  # fmt: skip
     try:
-        if given.twin is not None and o.source_poses is not None:
-            robots = given.twin.robots(tp.read_poses(o.source_poses, forward=forward_of(given.twin.source)))
-            mount = given.twin.mount(scanner)
+        if given.twin is not None:
+            robots, mount = twin_robots(o, given), given.twin.mount(scanner)
             return tp.calibrate_twin(scanner, poses, observations, twin=robots, mount=mount, **settings)
         if o.moving_scanner:
             return tp.calibrate_inverse(

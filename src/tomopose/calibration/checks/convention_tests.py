@@ -11,6 +11,7 @@ panel.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -52,6 +53,11 @@ BELONGING = 0.8
 BELONGING_MEAN = 2.0 * (1.0 - (1.0 - BELONGING) * np.log(1.0 / (1.0 - BELONGING)) / BELONGING)
 """Mean of the smallest BELONGING of chi2 values with 2 degrees of freedom (exponential, mean 2): 1.195."""
 
+SMALL_SHARE, DECISIVE = 0.02, 100.0
+"""Beyond FITS_SIGMAS an alternative is advised only where the machine's own errors can be what it leaves: at most
+SMALL_SHARE of the centres' spread (robots and hexapods with nominal geometry leave 0.004 to 0.009, wrong readings of
+robots' tables 0.2 to 0.7), and chi2 lowered by the factor DECISIVE, that is, residuals ten times smaller."""
+
 ITERATIONS = 20
 """An alternative that is right needs fewer; one that is wrong is not worth more."""
 
@@ -75,7 +81,8 @@ class Hypothesis:
     fit best;  delta: see above, 0 for the declared reading;  factor: chi2 of the declared reading over the
     alternative's, both floored at dof;  outcome: declared | better | same | worse | unfit;  symmetry: no plan could
     distinguish it;  length_factor: of `Alternative`;  ball_mm: distance of the ball from the focal spot, median;
-    d_SR: of the scanner, mm;  possible: every ball is between focal spot and panel.
+    d_SR: of the scanner, mm;  possible: every ball is between focal spot and panel;
+    share: d_rms over the spread of the centres.
     """
 
     name: str
@@ -93,6 +100,7 @@ class Hypothesis:
     ball_mm: float = 0.0
     d_SR: float = 0.0
     possible: bool = True
+    share: float = 0.0
 
     @property
     def off_axis(self) -> float:
@@ -101,8 +109,8 @@ class Hypothesis:
 
     @property
     def fits(self) -> bool:
-        """Whether the residual is at most `FITS_SIGMAS`."""
-        return self.sigmas <= FITS_SIGMAS
+        """Whether the residual is at most `FITS_SIGMAS`, or small enough for a machine's own errors."""
+        return self.sigmas <= FITS_SIGMAS or 0.0 < self.share <= SMALL_SHARE
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -122,6 +130,7 @@ class Hypothesis:
             "ball_mm": self.ball_mm,
             "d_SR_mm": self.d_SR,
             "possible": self.possible,
+            "share": self.share,
         }
 
 
@@ -158,7 +167,7 @@ class Diagnosis:
 
     @property
     def nothing_fits(self) -> bool:
-        """Whether every reading, the declared one included, leaves more than `FITS_SIGMAS`."""
+        """Whether every reading, the declared one included, leaves more than `Hypothesis.fits` allows."""
         return not any(h.fits for h in self.hypotheses)
 
     @property
@@ -222,6 +231,12 @@ def _rms(problem: Problem, fit: Fit, free: FreeParameters) -> float:
     return float(np.sqrt((r**2).sum(axis=1).mean()))
 
 
+def _share(problem: Problem, fit: Fit, free: FreeParameters) -> float:
+    """d_rms over the rms spread of the centres."""
+    spread = float(np.sqrt(((problem.x_D - problem.x_D.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    return _rms(problem, fit, free) / spread if spread > 0 else 0.0
+
+
 def residual_sigmas(problem: Problem, free: FreeParameters, fit: Fit) -> float:
     """rms residual of a coordinate in stated standard uncertainties, of the 80 % of the centres that fit best."""
     d2 = np.sort(whitened2(problem, residuals(problem, free, fit)))
@@ -257,6 +272,10 @@ class _Declared:
     def n_prior(self) -> int:
         return int((self.free.information > 0).sum())
 
+    def hypothesis(self, chi2: float) -> Hypothesis:
+        """The declared reading with another chi2: where movements are followed."""
+        return replace(self.own, chi2=chi2)
+
     def dof(self, problem: Problem) -> int:
         return 2 * len(problem) + self.n_prior - self.fit.N.shape[0]
 
@@ -269,7 +288,8 @@ class _Declared:
         chi2 = chi2_with_movements(self.problem, self.free, self.fit, moved)
         return min(found, float(np.sqrt(chi2 / self.dof(self.problem))))
 
-    def hypothesis(self) -> Hypothesis:
+    @functools.cached_property
+    def own(self) -> Hypothesis:
         return Hypothesis(
             name="declared",
             words="the data as declared",
@@ -284,6 +304,7 @@ class _Declared:
             ball_mm=self.placed.median,
             d_SR=self.placed.d_SR,
             possible=self.placed.possible,
+            share=_share(self.problem, self.fit, self.free),
         )
 
 
@@ -303,7 +324,7 @@ def ranked(
     held = free_parameters(problem.scanners, fix=tuple(UNITS))
     rays = ray_equations(problem)
     declared = _Declared(problem=problem, free=free, fit=fit, placed=placement(problem, fit))
-    found = [declared.hypothesis()]
+    found = [declared.own]
     for alternative in alternatives:
         changed = alternative.change(problem)
         if changed is None or declared.dof(changed) <= 0:
@@ -315,10 +336,29 @@ def ranked(
         judged = _judged_beside_movements(declared, alternative, changed, other)
         if judged is not None:
             found.append(judged)
-    return Diagnosis(hypotheses=tuple(sorted(found, key=_rank)))
+    return Diagnosis(hypotheses=rank(found))
 
 
-def _rank(h: Hypothesis) -> tuple[int, float]:
+def rank(found: Iterable[Hypothesis]) -> tuple[Hypothesis, ...]:
+    """Best first; see `_order`."""
+    return tuple(sorted(found, key=_order))
+
+
+def compared(declared: Hypothesis, other: Hypothesis) -> Hypothesis:
+    """`other` with delta, factor and outcome against `declared`; `possible` and `sigmas` of both are known."""
+    dof = declared.dof
+    chi2 = other.chi2 * dof / other.dof
+    delta = (chi2 - declared.chi2) / max(1.0, min(declared.chi2, chi2) / dof)
+    factor = max(declared.chi2, dof) / max(chi2, dof)
+    believable = chi2 < GOOD_CHI2 * dof or factor > CLEARLY
+    outcome = "better" if delta < -BETTER and believable else "same" if delta < SAME else "worse"
+    fits = other.sigmas <= FITS_SIGMAS or (0.0 < other.share <= SMALL_SHARE and factor > DECISIVE)
+    if outcome != "worse" and not (fits and other.possible):
+        outcome = "unfit"
+    return replace(other, delta=float(delta), factor=float(factor), outcome=outcome)
+
+
+def _order(h: Hypothesis) -> tuple[int, float]:
     """Better ones first, then the declared reading, then the others by their fit."""
     return {"better": 0, "declared": 1}.get(h.outcome, 2), h.delta
 
@@ -352,38 +392,35 @@ def _judged(
     """The comparison of one alternative; None where it puts a ball where none can be, or only renames the unit."""
     free = declared.free
     placed = placement(changed, other)
-    dof, dof_a = declared.dof(declared.problem), declared.dof(changed)
-    chi2_a = other.chi2 * dof / dof_a
-    delta = (chi2_a - chi2) / max(1.0, min(chi2, chi2_a) / dof)
-    factor = max(chi2, dof) / max(chi2_a, dof)
-    # a chi2 that follows a movement says what the reading leaves beside it
-    sigmas = min(residual_sigmas(changed, free, other), float(np.sqrt(other.chi2 / dof_a)))
-    believable = chi2_a < GOOD_CHI2 * dof or factor > CLEARLY
-    better = delta < -BETTER and believable
+    dof = declared.dof(changed)
+    judged = compared(
+        declared.hypothesis(chi2),
+        Hypothesis(
+            name=alternative.name,
+            words=alternative.words,
+            remedy=alternative.remedy,
+            d_rms=_rms(changed, other, free),
+            chi2=other.chi2,
+            dof=dof,
+            # a chi2 that follows a movement says what the reading leaves beside it
+            sigmas=min(residual_sigmas(changed, free, other), float(np.sqrt(other.chi2 / dof))),
+            delta=0.0,
+            factor=1.0,
+            outcome="worse",
+            symmetry=alternative.symmetry,
+            length_factor=alternative.length_factor,
+            ball_mm=placed.median,
+            d_SR=placed.d_SR,
+            possible=placed.possible,
+            share=_share(changed, other, free),
+        ),
+    )
     likelier = better_placed(placed, declared.placed) and not changed.units_confirmed
+    better = judged.outcome == "better" or (judged.outcome == "unfit" and judged.delta < -BETTER)
     if alternative.length_factor != 1.0 and not likelier and not (better and placed.possible):
         # centres alone cannot show the unit while the table keeps one angle; the ball's place on the beam can
         return None
-    outcome = "better" if better else "same" if delta < SAME else "worse"
-    if outcome != "worse" and not (sigmas <= FITS_SIGMAS and placed.possible):
-        outcome = "unfit"
-    return Hypothesis(
-        name=alternative.name,
-        words=alternative.words,
-        remedy=alternative.remedy,
-        d_rms=_rms(changed, other, free),
-        chi2=other.chi2,
-        dof=dof_a,
-        sigmas=sigmas,
-        delta=float(delta),
-        factor=float(factor),
-        outcome=outcome,
-        symmetry=alternative.symmetry,
-        length_factor=alternative.length_factor,
-        ball_mm=placed.median,
-        d_SR=placed.d_SR,
-        possible=placed.possible,
-    )
+    return judged
 
 
 def set_pose_alternative(problem: Problem, poses: PoseSequence | Iterable[PoseSequence]) -> Alternative | None:

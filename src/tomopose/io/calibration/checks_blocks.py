@@ -73,6 +73,7 @@ def hypothesis_from(row: Mapping[str, Any]) -> Hypothesis:
         ball_mm=number(row.get("ball_mm", 0.0)),
         d_SR=number(row.get("d_SR_mm", 0.0)),
         possible=bool(row.get("possible", True)),
+        share=number(row.get("share", 0.0)),
     )
 
 

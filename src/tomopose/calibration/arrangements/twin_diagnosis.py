@@ -1,0 +1,123 @@
+"""Alternative conventions of twin robots: either robot's table under another reading, or the images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from tomopose.calibration.arrangements.twin_robots import calibrate_twin
+from tomopose.calibration.checks.alternative import Alternative
+from tomopose.calibration.checks.convention_tests import Diagnosis, Hypothesis, compared, rank
+from tomopose.calibration.checks.conventions import ALTERNATIVES
+from tomopose.calibration.model.problem import Problem, pair
+from tomopose.calibration.result import Calibration
+from tomopose.errors import TomoposeError
+from tomopose.geometry.frames import Frame
+from tomopose.geometry.scanner import Scanner
+from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.poses import PoseSequence
+from tomopose.manipulator.twin import TwinRobots
+from tomopose.observations import BallObservations
+
+OF_TABLES = ("table sign", "table zero", "image turned by 180 degrees and table sign")
+"""Readings of a rotary table, which twin robots do not have."""
+
+
+def diagnose_twin(
+    scanner: Scanner,
+    poses: PoseSequence,
+    observations: BallObservations,
+    *,
+    twin: TwinRobots,
+    mount: RigidTransform,
+    free: Sequence[str] = (),
+    fix: Sequence[str] = (),
+) -> Diagnosis:
+    """Rank alternative conventions of both robots' tables and of the images; arguments as of `calibrate_twin`.
+
+    Of the list in `conventions` the quick ones are tried: each is a fit of both robots, which takes a second.  Both
+    robots are trusted (model "rigid").  Raises what `calibrate_twin` raises for the declared reading, but
+    NotConvergedError.
+    """
+
+    def fitted(own: PoseSequence, seen: BallObservations, robots: TwinRobots) -> Calibration | None:
+        try:
+            return calibrate_twin(
+                scanner, own, seen, twin=robots, mount=mount, model="rigid", robust=False, free=free, fix=fix
+            )
+        except (TomoposeError, np.linalg.LinAlgError):
+            # a wrong reading may lead anywhere; one that cannot be fitted is not the right one
+            return None
+
+    bare = replace(observations, ball_diameter=None)
+    declared = calibrate_twin(
+        scanner, poses, bare, twin=twin, mount=mount, model="rigid", robust=False, free=free, fix=fix
+    )
+    own = _hypothesis(declared, name="declared", words="the data as declared", remedy="", outcome="declared")
+    found = [own]
+    for alternative, of_poses, seen, robots in _readings(scanner, poses, bare, twin):
+        other = fitted(of_poses, seen, robots)
+        if other is not None and np.isfinite(other.chi2) and other.dof > 0:
+            one = _hypothesis(
+                other, name=alternative.name, words=alternative.words, remedy=alternative.remedy, outcome="worse"
+            )
+            found.append(compared(own, one))
+    return Diagnosis(hypotheses=rank(found))
+
+
+def _hypothesis(cal: Calibration, *, name: str, words: str, remedy: str, outcome: str) -> Hypothesis:
+    return Hypothesis(
+        name=name,
+        words=words,
+        remedy=remedy,
+        d_rms=cal.d_rms,
+        chi2=cal.chi2,
+        dof=cal.dof,
+        sigmas=float(np.sqrt(cal.chi2_dof)),
+        delta=0.0,
+        factor=1.0,
+        outcome=outcome,
+        share=cal.d_rms / float(np.sqrt(((cal.x_D - cal.x_D.mean(axis=0)) ** 2).sum(axis=1).mean())),
+    )
+
+
+def _readings(
+    scanner: Scanner, poses: PoseSequence, observations: BallObservations, twin: TwinRobots
+) -> Iterator[tuple[Alternative, PoseSequence, BallObservations, TwinRobots]]:
+    """Every alternative with the tables and centres that it would have."""
+    seen = observations.used
+    source = twin.source_poses.select(twin.source_poses.index_of(seen.pose_id))
+    for whose, table in (("detector", poses.select(poses.index_of(seen.pose_id))), ("source", source)):
+        problem = pair(scanner, table, seen)
+        for alternative in ALTERNATIVES:
+            tried = alternative.quick and alternative.name not in OF_TABLES
+            changed = alternative.change(problem) if tried else None
+            if changed is None:
+                continue
+            of_images = changed.x_D is not problem.x_D
+            if of_images and whose == "detector":
+                yield alternative, poses, _centres(changed), twin
+            elif not of_images:
+                named = replace(
+                    alternative,
+                    name=f"{whose}: {alternative.name}",
+                    words=f"{whose}'s robot: {alternative.words}",
+                    remedy=f"{whose}'s robot: {alternative.remedy}",
+                )
+                other = _table(table, changed)
+                if whose == "detector":
+                    yield named, other, seen, twin
+                else:
+                    yield named, poses, seen, replace(twin, source_poses=other)
+
+
+def _centres(changed: Problem) -> BallObservations:
+    return BallObservations(x_D=changed.x_D, covariance=changed.covariance, pose_id=changed.pose_id)
+
+
+def _table(poses: PoseSequence, changed: Problem) -> PoseSequence:
+    rows = poses.select(poses.index_of(changed.pose_id))
+    T_MH = RigidTransform(R=changed.R_MH, t=changed.t_MH, source=Frame.M, target=Frame.H)
+    return replace(rows, T_MH=T_MH, orientations=None)
