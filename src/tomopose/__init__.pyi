@@ -11,6 +11,11 @@ from .calibration.checks.alternative import Alternative as Alternative
 from .calibration.checks.convention_tests import Diagnosis as Diagnosis
 from .calibration.checks.convention_tests import Hypothesis as Hypothesis
 from .calibration.checks.convention_tests import diagnose as diagnose
+from .calibration.checks.stability import Effect as Effect
+from .calibration.checks.stability import OutlierBlock as OutlierBlock
+from .calibration.checks.stability import RepeatedPose as RepeatedPose
+from .calibration.checks.stability import Stability as Stability
+from .calibration.checks.verdict import Finding as Finding
 from .calibration.model.problem import Problem as Problem
 from .calibration.projection_matrices import projection_matrices as projection_matrices
 from .calibration.records.charts import ControlChart as ControlChart
@@ -20,9 +25,15 @@ from .calibration.records.compare import compare as compare
 from .calibration.records.history import append_history as append_history
 from .calibration.records.history import read_history as read_history
 from .calibration.records.truth import d_rms_exact as d_rms_exact
+from .calibration.result import Assumed as Assumed
 from .calibration.result import Calibration as Calibration
-from .calibration.result import Observability as Observability
+from .calibration.result import ModelComparison as ModelComparison
+from .calibration.result import ModelJudgement as ModelJudgement
 from .calibration.result import Parameter as Parameter
+from .calibration.result import PoseNoiseFound as PoseNoiseFound
+from .calibration.result import RotationResiduals as RotationResiduals
+from .calibration.result import ViewDistances as ViewDistances
+from .calibration.rigid.observability import Observability as Observability
 from .calibration.solve import calibrate as calibrate
 from .calibration.uncertainty.monte_carlo import MonteCarlo as MonteCarlo
 from .calibration.uncertainty.monte_carlo import monte_carlo as monte_carlo
@@ -35,6 +46,7 @@ from .engines.objects import to_cil as to_cil
 from .engines.objects import to_leap as to_leap
 from .engines.objects import to_rtk as to_rtk
 from .engines.objects import to_tigre as to_tigre
+from .errors import InputWarning as InputWarning
 from .errors import TomoposeError as TomoposeError
 from .exports.folder import Exported as Exported
 from .exports.folder import export as export
@@ -60,7 +72,6 @@ from .io.images.writing import write_hdf5 as write_hdf5
 from .io.images.writing import write_tiff as write_tiff
 from .io.matrices_npz import read_matrices as read_matrices
 from .io.matrices_npz import write_matrices as write_matrices
-from .io.notices import InputWarning as InputWarning
 from .io.observations_csv import read_observations as read_observations
 from .io.observations_csv import write_observations as write_observations
 from .io.pairing import pair_images as pair_images
@@ -71,6 +82,13 @@ from .io.scanner_json import write_scanner as write_scanner
 from .io.table_text import TextTable as TextTable
 from .io.volume_files import read_volume as read_volume
 from .io.volume_files import write_volume as write_volume
+from .manipulator.error_models import EmpiricalErrors as EmpiricalErrors
+from .manipulator.error_models import IdentifiedErrors as IdentifiedErrors
+from .manipulator.error_models import Lag as Lag
+from .manipulator.error_models import PoseRange as PoseRange
+from .manipulator.error_models import PoseScatter as PoseScatter
+from .manipulator.error_models import RigidErrors as RigidErrors
+from .manipulator.error_models import TwinErrors as TwinErrors
 from .manipulator.error_models import commands_for as commands_for
 from .manipulator.error_models import corrected_poses as corrected_poses
 from .manipulator.files import read_manipulator as read_manipulator
@@ -105,9 +123,9 @@ from .measurement.plan import read_plan as read_plan
 from .measurement.probing import Probing as Probing
 from .measurement.probing import probe as probe
 from .measurement.result import Decision as Decision
-from .measurement.results import MeasurementResult as MeasurementResult
+from .measurement.result import MeasurementResult as MeasurementResult
+from .measurement.result import Repeat as Repeat
 from .measurement.results import MeasurementResults as MeasurementResults
-from .measurement.results import Repeat as Repeat
 from .measurement.surface.edges import Edges as Edges
 from .measurement.surface.edges import EdgeSettings as EdgeSettings
 from .measurement.surface.grey_levels import GreyLevels as GreyLevels
@@ -115,6 +133,7 @@ from .measurement.surface.surface import Surface as Surface
 from .measurement.surface.surface import surface as surface
 from .measurement.uncertainty import Simulated as Simulated
 from .observations import BallObservations as BallObservations
+from .planning.design import DesignSettings as DesignSettings
 from .planning.design import PosePlan as PosePlan
 from .planning.design import plan_poses as plan_poses
 from .planning.limits import PlanLimits as PlanLimits
@@ -145,6 +164,7 @@ from .simulation.physics.spectrum import Tube as Tube
 from .simulation.projector.focal_spot import FocalSpot as FocalSpot
 from .simulation.projector.focal_spot import Motion as Motion
 from .simulation.projector.rays import Compiled as Compiled
+from .simulation.projector.rays import SolidArrays as SolidArrays
 from .simulation.run import SimulatedRun as SimulatedRun
 from .simulation.run import simulate_ball_run as simulate_ball_run
 from .simulation.scene.build import simulate as simulate
@@ -184,21 +204,3 @@ from .volume import Volume as Volume
 from .volume import VoxelGrid as VoxelGrid
 
 __version__: str
-from .calibration.checks.stability import Effect as Effect
-from .calibration.checks.stability import OutlierBlock as OutlierBlock
-from .calibration.checks.stability import RepeatedPose as RepeatedPose
-from .calibration.checks.stability import Stability as Stability
-from .calibration.checks.verdict import Finding as Finding
-from .calibration.result import Assumed as Assumed
-from .calibration.result import ModelComparison as ModelComparison
-from .calibration.result import ModelJudgement as ModelJudgement
-from .calibration.result import PoseNoiseFound as PoseNoiseFound
-from .calibration.result import RotationResiduals as RotationResiduals
-from .calibration.result import ViewDistances as ViewDistances
-from .manipulator.error_models import EmpiricalErrors as EmpiricalErrors
-from .manipulator.error_models import IdentifiedErrors as IdentifiedErrors
-from .manipulator.error_models import Lag as Lag
-from .manipulator.error_models import PoseRange as PoseRange
-from .manipulator.error_models import PoseScatter as PoseScatter
-from .manipulator.error_models import RigidErrors as RigidErrors
-from .manipulator.error_models import TwinErrors as TwinErrors

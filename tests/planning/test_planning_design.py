@@ -10,7 +10,7 @@ from tomopose.calibration.solve import calibrate
 from tomopose.errors import InputError, NotObservableError, OutOfReachError
 from tomopose.geometry.projection import project_ball
 from tomopose.observations import BallObservations
-from tomopose.planning.design import SIGMA_PX, nominal_mount, plan_poses, predicted_covariance
+from tomopose.planning.design import SIGMA_PX, DesignSettings, nominal_mount, plan_poses, predicted_covariance
 from tomopose.planning.limits import PlanLimits, allowed, candidates
 from tomopose.planning.resolve import resolvability
 from tomopose.planning.target import scan_target
@@ -18,6 +18,7 @@ from tomopose.trajectory.feasibility import TravelLimits, travel
 from tomopose.trajectory.pose_grid import pose_grid
 
 BALL = np.array([8.0, -6.0, 17.0])
+ALONE = DesignSettings(resolve=False)
 TURNED = PlanLimits(table_angles=(0.0, np.pi / 2))
 
 
@@ -57,10 +58,10 @@ def test_the_still_table_needs_at_most_72_and_says_what_stays_hidden(paper_scann
     assert "half a pixel" in plan.resolved.words[0]
 
 
-def test_few_images_are_chosen_so_that_rivals_show(paper_scanner):
+def test_few_images_are_chosen_so_that_alternatives_show(paper_scanner):
     """Eight images chosen for the scan alone would let half a pixel pass; the plan takes poses that show it."""
     plan = plan_poses(paper_scanner, t=BALL, n=8, limits=TURNED)
-    alone = plan_poses(paper_scanner, t=BALL, n=8, limits=TURNED, resolve=False)
+    alone = plan_poses(paper_scanner, t=BALL, n=8, limits=TURNED, settings=ALONE)
     hidden = resolvability(paper_scanner, alone.poses, T_HT=nominal_mount(), t=BALL, sigma=SIGMA_PX)
     assert {h.name for h in hidden.unresolved} == {"half a pixel low", "half a pixel high"}
     assert plan.resolved.unresolved == ()
@@ -118,8 +119,8 @@ def test_the_target_is_the_spread_of_simulated_scans(paper_scanner, rng):
 
 def test_freed_parameters_need_table_angles(paper_scanner):
     with pytest.raises(NotObservableError, match="d_SR"):
-        plan_poses(paper_scanner, t=BALL, n=40, free=("d_SR",), resolve=False)
-    plan = plan_poses(paper_scanner, t=BALL, n=40, free=("d_SR", "u_0", "eta"), limits=TURNED, resolve=False)
+        plan_poses(paper_scanner, t=BALL, n=40, free=("d_SR",), settings=ALONE)
+    plan = plan_poses(paper_scanner, t=BALL, n=40, free=("d_SR", "u_0", "eta"), limits=TURNED, settings=ALONE)
     assert plan.u["d_SR"] < 0.01
     assert plan.u["u_0"] < 0.05
 
@@ -138,25 +139,25 @@ def test_narrow_fields_boxes_and_magnification(paper_scanner):
 
 
 def test_time_bounds_the_number_of_images(paper_scanner):
-    plan = plan_poses(paper_scanner, t=BALL, n=20, limits=PlanLimits(total_time=150.0), resolve=False)
+    plan = plan_poses(paper_scanner, t=BALL, n=20, limits=PlanLimits(total_time=150.0), settings=ALONE)
     assert plan.duration <= 150.0
     with pytest.raises(InputError, match="time"):
-        plan_poses(paper_scanner, t=BALL, n=100, limits=PlanLimits(total_time=150.0), resolve=False)
+        plan_poses(paper_scanner, t=BALL, n=100, limits=PlanLimits(total_time=150.0), settings=ALONE)
 
 
 def test_a_goal_out_of_reach_is_refused(paper_scanner):
     with pytest.raises(NotObservableError, match="images reach"):
-        plan_poses(paper_scanner, t=BALL, goal=1e-5, resolve=False)
+        plan_poses(paper_scanner, t=BALL, goal=1e-5, settings=ALONE)
 
 
 def test_plans_are_deterministic(paper_scanner):
-    a, b = (plan_poses(paper_scanner, t=BALL, n=20, limits=TURNED, resolve=False) for _ in range(2))
+    a, b = (plan_poses(paper_scanner, t=BALL, n=20, limits=TURNED, settings=ALONE) for _ in range(2))
     np.testing.assert_array_equal(a.poses.T_MH.t, b.poses.T_MH.t)
 
 
 def test_d_optimal_plans_shrink_the_volume(paper_scanner):
-    a = plan_poses(paper_scanner, t=BALL, n=24, limits=TURNED, resolve=False)
-    d = plan_poses(paper_scanner, t=BALL, n=24, limits=TURNED, criterion="D", resolve=False)
+    a = plan_poses(paper_scanner, t=BALL, n=24, limits=TURNED, settings=ALONE)
+    d = plan_poses(paper_scanner, t=BALL, n=24, limits=TURNED, settings=DesignSettings(criterion="D", resolve=False))
     assert np.linalg.slogdet(d.covariance)[1] < np.linalg.slogdet(a.covariance)[1]
     assert d.predicted > a.predicted
 

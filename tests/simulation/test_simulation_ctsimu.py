@@ -14,7 +14,7 @@ from tomopose.geometry.frames import Frame
 from tomopose.simulation.objects.mesh import write_stl
 from tomopose.simulation.objects.shapes import Solid, box, cylinder
 from tomopose.simulation.projector.focal_spot import FocalSpot
-from tomopose.simulation.run import simulate_ball_run, transmission
+from tomopose.simulation.run import ball_spectrum, simulate_ball_run, transmission
 from tomopose.simulation.scene.ctsimu import run_from_ctsimu, run_to_ctsimu
 
 pytest.importorskip("embreex")
@@ -28,7 +28,9 @@ def run():
     mount = RigidTransform.from_angles([0.02, 0.03, 3.1], [0.5, -0.4, 0.3], source=Frame.H, target=Frame.T)
     poses = PoseSequence.from_table([[0, 0, 0], [1, 2, -1]], [[0, 0, 0], [5, -3, 2]], alpha=np.array([0.0, 0.7]))
     solids = (Solid(shape=(box(6, 4, 5) - cylinder(1, -5, 5)).placed(t=[0.5, 1.0, -1.0]), material="Al"),)
-    made = simulate_ball_run(scanner, T_HT=mount, t=np.zeros(3), poses=poses, solids=solids, copper=0.3)
+    made = simulate_ball_run(
+        scanner, T_HT=mount, t=np.zeros(3), poses=poses, solids=solids, spectrum=ball_spectrum(copper=0.3)
+    )
     return replace(made, t=None, ball_diameter=None, spot=FocalSpot(shape="gaussian", size_u=0.05, size_v=0.05))
 
 

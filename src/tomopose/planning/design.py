@@ -26,6 +26,7 @@ from tomopose.planning.target import ScanTarget, scan_target
 from tomopose.trajectory.pose_grid import pose_grid
 from tomopose.trajectory.tilt import R_HT_MOUNTED
 from tomopose.units import Array
+from tomopose.values import value
 
 SIGMA_PX = 0.0207 / np.sqrt(2.0)
 """Standard uncertainty of a coordinate of a centre: the paper's d_rms of 0.0207 px counts both (eq. 8)."""
@@ -116,6 +117,95 @@ def _largest_affordable(limits: PlanLimits) -> int:
     return min(MOST_IMAGES, int(limits.total_time // (limits.image_time + limits.settle)))
 
 
+@value
+class DesignSettings:
+    """How a plan is searched.
+
+    sigma:     expected standard uncertainty of a centre's coordinate, px.
+    criterion: "A": the scan reprojection error itself;  "D": the volume of the confidence region.
+    resolve:   also see to it that the poses show every alternative convention that the limits let them show, by 5
+               sigma, and find which they would not.
+    seed:      of the exchange's starts.
+    """
+
+    sigma: float = SIGMA_PX
+    criterion: Criterion = "A"
+    resolve: bool = True
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.sigma > 0:
+            raise InputError(f"sigma is {self.sigma}; a positive number of pixels is needed")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Search:
+    """All that a choice of poses rests on.
+
+    pool: candidates; L (n, 2, m): whitened rows of each; prior (m, m); T_HT, t: nominal mount and ball; goal: scan
+    reprojection error, px rms, to reach with as few images as possible, where n, the number of images, is None.
+    """
+
+    scanner: Scanner
+    T_HT: RigidTransform
+    t: Array
+    limits: PlanLimits
+    settings: DesignSettings
+    target: ScanTarget
+    pool: PoseSequence
+    L: Array
+    prior: Array
+    n: int | None
+    goal: float
+
+    def choose(self, k: int, must: list[int]) -> Chosen:
+        """k images, those of `must` among them (half of k at most), one pose twice: the first, which ends the run."""
+        how: dict[str, Any] = {
+            "M": self.target.M, "N_0": self.prior, "criterion": self.settings.criterion, "seed": self.settings.seed,
+            "fixed": must[: k // 2],
+        }  # fmt: skip
+        best = exchange(self.L, k, **how)
+        if len(np.unique(best.index)) < k:
+            return best
+        fewer = exchange(self.L, k - 1, **how)
+        index = np.append(fewer.index, fewer.index[0])
+        N = np.einsum("kia,kib->ab", self.L[index], self.L[index]) + self.prior
+        return Chosen(index=index, covariance=inverse_information(N), value=np.nan)
+
+    def design(self, must: list[int]) -> tuple[PoseSequence, Chosen]:
+        """Poses in the order in which they are driven, within the time allowed."""
+        most, least = _largest_affordable(self.limits), len(self.prior)
+        if self.n is not None:
+            chosen = self.choose(_checked(self.n, most), must)
+        else:
+            chosen = _fewest(lambda k: self.choose(k, must), self.target, self.goal, most, least)
+        poses = ordered(rows_of(self.pool, chosen.index), self.limits)
+        allowed = self.limits.total_time
+        while allowed is not None and run_time(poses, self.limits) > allowed and len(poses) > least:
+            chosen = self.choose(len(poses) - max(1, len(poses) // 20), must)
+            poses = ordered(rows_of(self.pool, chosen.index), self.limits)
+        return poses, chosen
+
+    def resolving(self, poses: PoseSequence, chosen: Chosen) -> tuple[PoseSequence, Resolvability]:
+        """Poses that show more alternative conventions, from those given, and what they show."""
+        must: list[int] = []
+        given: dict[str, Any] = {"T_HT": self.T_HT, "t": self.t, "sigma": self.settings.sigma}
+        resolved = resolvability(self.scanner, poses, **given)
+        everything = exact_problem(self.scanner, self.pool, **given)
+        for _ in range(RESOLVING_ROUNDS):
+            more = telling(everything, chosen.index, resolved.unresolved, max(2, len(poses) // 8))
+            if not more or 2 * len(must) > len(poses):
+                break
+            must += more
+            other, other_chosen = self.design(must)
+            better = resolvability(self.scanner, other, **given)
+            # poses forced in for an alternative that they do not help against only cost accuracy
+            if better.score <= resolved.score and _least(better) <= 1.1 * _least(resolved):
+                break
+            poses, chosen, resolved = other, other_chosen, better
+        return poses, resolved
+
+
 def plan_poses(
     scanner: Scanner,
     *,
@@ -123,15 +213,12 @@ def plan_poses(
     t: ArrayLike = BALL_MM,
     n: int | None = None,
     goal: float | None = None,
-    sigma: float = SIGMA_PX,
     limits: PlanLimits | None = None,
     scan: PoseSequence | None = None,
-    points: Any = None,
+    points: ArrayLike | None = None,
     free: Iterable[str] = (),
     priors: Mapping[str, float] | None = None,
-    criterion: Criterion = "A",
-    resolve: bool = True,
-    seed: int = 0,
+    settings: DesignSettings | None = None,
 ) -> PosePlan:
     """The best calibration poses for a scan.
 
@@ -141,14 +228,11 @@ def plan_poses(
                mistakes; the default is 20 mm off.
     n, goal:   number of images (the repeated first one included), or the scan reprojection error, px rms, to reach with
                as few as possible (default: what the paper's 189 poses reach).
-    sigma:     expected standard uncertainty of a centre's coordinate, px.
     limits:    travel, table angles, field of view, magnification, boxes, time.
     scan, points: what the calibration is for: the scan's poses and the object's points (p, 3) in W, mm
                (default: the paper's tilted scan, eq. (11), and a box of +-15, +-15, +-30 mm).
     free, priors: scanner parameters to be estimated too, as in `calibrate`.
-    criterion: "A": the scan reprojection error itself;  "D": the volume of the confidence region.
-    resolve:   also see to it that the poses show every alternative convention that these limits let them show, by 5
-               sigma, and find which they would not.
+    settings:  expected noise, criterion, search.
 
     Raises
     ------
@@ -157,67 +241,31 @@ def plan_poses(
     T_HT = nominal_mount() if T_HT is None else T_HT.require(Frame.H, Frame.T)
     ball = np.asarray(t, dtype=np.float64).reshape(3)
     limits = PlanLimits() if limits is None else limits
-    if not sigma > 0:
-        raise InputError(f"sigma is {sigma}; a positive number of pixels is needed")
+    settings = DesignSettings() if settings is None else settings
     freed = free_parameters((scanner,), free=free, priors=priors)
     target = scan_target(scanner, T_HT=T_HT, scan=scan, points=points, free=freed)
     pool = candidates(scanner, T_HT=T_HT, t=ball, limits=limits)
-    L = pose_information(scanner, pool, T_HT=T_HT, t=ball, sigma=sigma, free=freed)
+    noise: dict[str, Any] = {"T_HT": T_HT, "t": ball, "sigma": settings.sigma}
+    L = pose_information(scanner, pool, free=freed, **noise)
     prior = _prior_information(freed)
     _require_determined(L, prior, target)
     reference = scan_target(scanner, T_HT=T_HT, scan=scan, points=points).rms(
-        predicted_covariance(scanner, pose_grid(3), T_HT=T_HT, t=ball, sigma=sigma)
+        predicted_covariance(scanner, pose_grid(3), **noise)
     )
-
-    must: list[int] = []
-
-    def choose(k: int) -> Chosen:
-        """k images, one pose among them twice: the first, which the run ends with."""
-        held = must[: k // 2]
-        best = exchange(L, k, M=target.M, N_0=prior, criterion=criterion, seed=seed, fixed=held)
-        if len(np.unique(best.index)) < k:
-            return best
-        fewer = exchange(L, k - 1, M=target.M, N_0=prior, criterion=criterion, seed=seed, fixed=held)
-        index = np.append(fewer.index, fewer.index[0])
-        N = np.einsum("kia,kib->ab", L[index], L[index]) + prior
-        return Chosen(index=index, covariance=inverse_information(N), value=np.nan)
-
-    def design() -> tuple[PoseSequence, Chosen]:
-        most = _largest_affordable(limits)
-        if n is not None:
-            chosen = choose(_checked(n, most))
-        else:
-            chosen = _fewest(choose, target, reference if goal is None else goal, most, len(prior))
-        poses = ordered(rows_of(pool, chosen.index), limits)
-        while limits.total_time is not None and run_time(poses, limits) > limits.total_time and len(poses) > len(prior):
-            chosen = choose(len(poses) - max(1, len(poses) // 20))
-            poses = ordered(rows_of(pool, chosen.index), limits)
-        return poses, chosen
-
-    poses, chosen = design()
+    search = _Search(
+        scanner=scanner, T_HT=T_HT, t=ball, limits=limits, settings=settings, target=target, pool=pool, L=L,
+        prior=prior, n=n, goal=reference if goal is None else goal,
+    )  # fmt: skip
+    poses, chosen = search.design([])
     resolved = None
-    if resolve:
-        given: dict[str, Any] = {"T_HT": T_HT, "t": ball, "sigma": sigma}
-        resolved = resolvability(scanner, poses, **given)
-        everything = exact_problem(scanner, pool, **given)
-        for _ in range(RESOLVING_ROUNDS):
-            more = telling(everything, chosen.index, resolved.unresolved, max(2, len(poses) // 8))
-            if not more or 2 * len(must) > len(poses):
-                break
-            must += more
-            other, other_chosen = design()
-            better = resolvability(scanner, other, **given)
-            # poses forced in for an alternative that they do not help against only cost accuracy
-            if better.score <= resolved.score and _least(better) <= 1.1 * _least(resolved):
-                break
-            poses, chosen, resolved = other, other_chosen, better
-    covariance = predicted_covariance(scanner, poses, T_HT=T_HT, t=ball, sigma=sigma, free=freed)
-    names = tangent_names((0,), freed)
+    if settings.resolve:
+        poses, resolved = search.resolving(poses, chosen)
+    covariance = predicted_covariance(scanner, poses, free=freed, **noise)
     return PosePlan(
         poses=poses,
         predicted=target.rms(covariance),
         reference=reference,
-        u=dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+        u=dict(zip(tangent_names((0,), freed), np.sqrt(np.diag(covariance)).tolist(), strict=True)),
         covariance=covariance,
         resolved=resolved,
         duration=run_time(poses, limits),

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.frames import Frame
@@ -222,19 +223,23 @@ def render(run: SimulatedRun, i: int, *, threads: int = 1) -> Any:
     return expose(signal(run, i, threads=threads), run.detector, run.scanner, seed=run.seed, frame=i, threads=threads)
 
 
+def ball_spectrum(voltage: float = 120.0, copper: float = 0.5) -> Spectrum:
+    """Tungsten anode at that voltage, kV, copper filter, mm, absorbed in 0.6 mm of CsI."""
+    return tube_spectrum(voltage).filtered("Cu", copper).absorbed_energy("CsI", 0.6)
+
+
 def simulate_ball_run(
     scanner: Scanner,
     *,
     T_HT: RigidTransform,
-    t: Any,
+    t: ArrayLike,
     poses: PoseSequence,
     ball_diameter: float = 8.0,
     snr: float = 200.0,
     blur_sigma: float = 0.7,
     seed: int = 0,
     T_MH: RigidTransform | None = None,
-    voltage: float = 120.0,
-    copper: float = 0.5,
+    spectrum: Spectrum | None = None,
     white: float = 45000.0,
     solids: tuple[Solid, ...] | None = None,
 ) -> SimulatedRun:
@@ -246,19 +251,18 @@ def simulate_ball_run(
     T_HT, t:       true mount and ball position (mm in M): what a calibration has to find.
     poses:         poses as recorded; T_MH: the true ones (default: the recorded ones).
     ball_diameter: mm.  snr: of the empty beam, one pixel.  blur_sigma: px.  white: grey value of the empty beam.
-    voltage, copper: tube voltage (kV, tungsten anode) and copper filter (mm); the detector is 0.6 mm of CsI.
+    spectrum:      absorbed energy by photon energy; the default is `ball_spectrum()`.
     solids:        other solids than `ball_in_holder`.
     """
-    spectrum = tube_spectrum(voltage).filtered("Cu", copper).absorbed_energy("CsI", 0.6)
     return SimulatedRun(
         scanner=scanner,
         poses=poses,
         T_HT=T_HT,
         T_MH=poses.T_MH if T_MH is None else T_MH,
-        t=t,
+        t=np.asarray(t, dtype=np.float64),
         ball_diameter=ball_diameter,
         solids=ball_in_holder(t=t, ball_diameter=ball_diameter) if solids is None else solids,
-        spectrum=spectrum,
+        spectrum=ball_spectrum() if spectrum is None else spectrum,
         detector=Detector(snr=snr, blur_sigma=blur_sigma, white=white),
         seed=seed,
     )
