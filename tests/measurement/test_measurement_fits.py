@@ -232,7 +232,7 @@ class TestMeasurands:
     def plane(self, z, up):
         points, normals = plane_pattern([0, 0, z], [0, 0, up], [1, 0, 0], [0, 1, 0], 60)
         f = fit_plane(points + 0.001 * np.random.default_rng(6).standard_normal(points.shape))
-        from tomopose.measurement.measure import _turned
+        from tomopose.measurement.bench import _turned
 
         return f if f.direction @ normals[0] > 0 else _turned(f)
 
