@@ -34,7 +34,7 @@ from mutants import mutant
 from tomopose.errors import TomoposeError
 
 BATCH = 100
-HANG_SECONDS = 20.0
+HANG_SECONDS = 60.0
 GROWTH = 2**30
 
 
