@@ -87,19 +87,23 @@ def matrices(scanner: tp.Scanner) -> ProjectionMatrices:
     )
 
 
-def corpus(folder: Path) -> list[Seed]:
-    """All seeds, written into a folder."""
+GROUPS = ("tables", "geometry", "machines", "images", "volumes", "meshes", "texts")
+
+
+def corpus(folder: Path, groups: tuple[str, ...] = GROUPS) -> list[Seed]:
+    """The seeds of these groups, written into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     scanner = tp.Scanner(d_SD=1200.0, d_SR=310.0, p_u=0.2, p_v=0.25, u_0=15.4, v_0=11.7, n_u=31, n_v=25)
-    return [
-        *_tables(folder / "tables", scanner),
-        *_geometry(folder / "geometry", scanner),
-        *_machines(folder / "machines"),
-        *_images(folder / "images"),
-        *_volumes(folder / "volumes"),
-        *_meshes(folder / "meshes"),
-        *_texts(folder / "texts"),
-    ]
+    made: dict[str, Callable[[Path], Iterator[Seed]]] = {
+        "tables": lambda place: _tables(place, scanner),
+        "geometry": lambda place: _geometry(place, scanner),
+        "machines": _machines,
+        "images": _images,
+        "volumes": _volumes,
+        "meshes": _meshes,
+        "texts": _texts,
+    }
+    return [seed for group in groups for seed in made[group](folder / group)]
 
 
 def _tables(folder: Path, scanner: tp.Scanner) -> Iterator[Seed]:
@@ -140,9 +144,12 @@ def _geometry(folder: Path, scanner: tp.Scanner) -> Iterator[Seed]:
     tp.write_matrices(folder / "matrices.npz", views)
     yield Seed(kind="matrices", path=folder / "matrices.npz", read=tp.read_matrices)
     export(views, folder / "out")
-    files = tuple(sorted(folder.glob("out/*")))
+    files = tuple(p for p in sorted(folder.glob("out/*")) if p.is_file())
     yield Seed(kind="manifest", path=folder / "out/manifest.json", read=read_geometry, beside=files)
     bare = tuple(p for p in files if p.name != "manifest.json")
+    view = next(iter(sorted(folder.glob("out/thd/*.json"))), None)
+    if view is not None:
+        yield Seed(kind="geometry thd", path=view, read=lambda path: read_geometry(path.parent))
     for path in bare:
         if path.name == "rtk.json":
             yield Seed(kind="rtk side", path=path, read=with_side, beside=bare)

@@ -28,7 +28,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from corpus import Seed, corpus
+from corpus import GROUPS, Seed, corpus
 from mutants import mutant
 
 from tomopose.errors import TomoposeError
@@ -125,17 +125,26 @@ def keep(
     (kept / "index.json").write_text(json.dumps(index, indent=1))
 
 
-def fuzz(*, minutes: float, name: str, kinds: tuple[str, ...] = (), kept: Path | None = None, most: int = 0) -> Count:
+def fuzz(
+    *,
+    minutes: float,
+    name: str,
+    kinds: tuple[str, ...] = (),
+    kept: Path | None = None,
+    most: int = 0,
+    groups: tuple[str, ...] = GROUPS,
+) -> Count:
     """Mutants of all kinds in turn until the time is over, or `most` of each kind are read."""
     count, index = Count(), {}
     end = time.monotonic() + 60 * minutes
     with tempfile.TemporaryDirectory() as root:
-        seeds = [s for s in corpus(Path(root) / "seeds") if not kinds or s.kind.startswith(kinds)]
+        seeds = [s for s in corpus(Path(root) / "seeds", groups) if not kinds or s.kind.startswith(kinds)]
         for number, seed in enumerate(seeds):
             place = Path(root) / str(number)
             place.mkdir()
             for path in seed.beside:
-                shutil.copy(path, place / path.name)
+                if path.is_file():
+                    shutil.copy(path, place / path.name)
             one(seed, seed.path.read_bytes(), place)  # what is compiled or imported once is not the mutants' growth
         begun, first = dict.fromkeys(range(len(seeds)), 0), 0
         while time.monotonic() < end and (not most or first < most):

@@ -31,7 +31,10 @@ def require_absent(path: str | Path, *, force: bool = False) -> Path:
     """The path, if nothing is there or `force` allows to overwrite it; FileError otherwise."""
     path = Path(path)
     try:
-        there = os.path.lexists(path)
+        os.lstat(path)
+        there = True
+    except (FileNotFoundError, NotADirectoryError):
+        there = False
     except (OSError, ValueError) as error:
         raise FileError(f"{str(path)[:200]} is no path that can be written: {error}", path=path) from error
     if there and path.is_symlink() and not path.exists():
@@ -76,10 +79,10 @@ def atomic_folder(path: str | Path, *, force: bool = False, stale: Iterable[str]
     A second writer of the same folder is refused.
     """
     path = Path(path)
-    if path.exists():
-        path = path.resolve()
     temporary: Path | None = None
     try:
+        if path.exists():
+            path = path.resolve()
         if os.path.lexists(path) and not path.is_dir():
             raise FileError(f"{path} is a file or a link to nothing; a folder is needed", path=path)
         with only_writer(path):
@@ -121,8 +124,9 @@ def _take_the_place(path: Path, new: Path, made: list[Path], stale: set[Path]) -
                 if name not in stale and name not in made:
                     (new / name).parent.mkdir(parents=True, exist_ok=True)
                     os.link(path / name, new / name, follow_symlinks=False)
-            for folder in (p.relative_to(path) for p in path.rglob("*") if p.is_dir() and not p.is_symlink()):
-                (new / folder).mkdir(parents=True, exist_ok=True)
+            for folder in (p for p in path.rglob("*") if p.is_dir() and not p.is_symlink()):
+                if not any(folder.iterdir()):
+                    (new / folder.relative_to(path)).mkdir(parents=True, exist_ok=True)
             shutil.copymode(path, new)
             sync_folder(new)
             if _exchanged(new, path):

@@ -14,6 +14,7 @@ import numpy as np
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, ProjectionBlocks
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.model.unseen import turns
+from tomopose.geometry.extent import largest_distance
 from tomopose.geometry.rotations import skew
 from tomopose.units import Array
 
@@ -98,7 +99,7 @@ def _length(name: str, kind: str, short: str, text: str, factor: float, order: i
     def words(size: Array, px: float, at: str) -> str:
         course = np.polynomial.legendre.legvander(np.linspace(-1, 1, 40), order)[:, 1:]
         path = course @ size.reshape(order, -1)
-        return text.format(float(np.linalg.norm(path[:, None] - path[None], axis=2).max()) * factor)
+        return text.format(largest_distance(path) * factor)
 
     return Effect(name=name, kind=kind, short=short, words=words)
 

@@ -21,6 +21,7 @@ from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.rigid.fit import Fit, linear_fit
+from tomopose.geometry.extent import largest_distance
 from tomopose.geometry.rotations import rotation_angle_between
 from tomopose.units import Array
 
@@ -120,7 +121,7 @@ def drift(fit: LinearFit, columns: Array, *, name: str, words: str, unit: tuple[
     before, left = float((rest**2).sum()), float((after**2).sum())
     gain = before - left
     path = course @ move.reshape(DRIFT_ORDER, c)
-    reach = float(np.linalg.norm(path[:, None] - path[None], axis=2).max())
+    reach = largest_distance(path)
     size = _size_px(fit, moved @ move)
     factor, symbol = unit
     return Effect(

@@ -1,0 +1,149 @@
+"""Kill programs that write at random moments: what they leave is the whole old result or the whole new one.
+
+    python benchmarks/fuzz/kills.py --kills 200 --seed 1
+
+A program writes two states of a result in turn, over and over, until a signal (KILL, TERM or INT) ends it.  Then the
+result must be one of the two, the next run must succeed, and nothing of the killed one may stay beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+import tomopose as tp
+from tomopose.exports.folder import export
+from tomopose.files import atomic_folder, write_json, write_text
+from tomopose.io.volume_files import write_volume
+
+SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+
+
+def geometry(state: int) -> tp.ProjectionMatrices:
+    """Five views about 300 + state mm from the source."""
+    P = np.tile(np.array([[1000.0, 0, 10, 1e5], [0, 1000.0, 20, 1e5], [0, 0, 1.0, 300.0 + state]]), (5, 1, 1))
+    return tp.ProjectionMatrices(P=P, n_u=101, n_v=103, p_u=0.2, p_v=0.2, pose_id=tuple("abcde"))
+
+
+def write_exports(folder: Path, state: int) -> None:
+    formats = ["leap", "cil", "pyronn"] if state else ["leap", "cil", "cera"]
+    export(geometry(state), folder / "out", formats=formats, force=True)
+
+
+def write_results(folder: Path, state: int) -> None:
+    with atomic_folder(folder / "out", force=True, stale=("only-0.csv", "only-1.csv")) as made:
+        write_json(made / "study.json", "study", {"state": state, "values": list(range(2000))})
+        write_text(made / "table.csv", f"{state}\n" * 2000)
+        write_text(made / f"only-{state}.csv", f"{state}\n")
+
+
+def write_matrices(folder: Path, state: int) -> None:
+    tp.write_matrices(folder / "out.npz", geometry(state), force=True)
+
+
+def write_hdf5_volume(folder: Path, state: int) -> None:
+    grid = tp.VoxelGrid(shape=(20, 60, 60), spacing=0.1)
+    write_volume(tp.Volume(values=np.full(grid.shape, state, np.float32), grid=grid), folder / "out.h5", force=True)
+
+
+WRITERS: dict[str, Callable[[Path, int], None]] = {
+    "exports": write_exports,
+    "results": write_results,
+    "matrices": write_matrices,
+    "volume": write_hdf5_volume,
+}
+
+PROGRAM = """
+import itertools, signal, sys
+sys.path[:0] = [sys.argv[1]]
+from pathlib import Path
+import kills
+from tomopose.cli.main import Terminated
+def end(number, frame):
+    raise Terminated
+signal.signal(signal.SIGTERM, end)
+write, folder = kills.WRITERS[sys.argv[2]], Path(sys.argv[3])
+try:
+    for k in itertools.count():
+        write(folder, k % 2)
+        if k == 1:
+            print("ready", flush=True)
+except KeyboardInterrupt:
+    pass
+"""
+
+
+def content(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file, by name; times of making are no part of a state, so JSON with provenance is left out."""
+    files = (p for p in sorted(folder.rglob("*")) if p.is_file() and p.name != "manifest.json")
+    return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+def untimed(found: dict[str, str]) -> dict[str, str]:
+    """Without the files that hold the time of their making."""
+    return {name: digest for name, digest in found.items() if not name.endswith((".config", "projtable.txt", ".h5"))}
+
+
+def visible(folder: Path) -> dict[str, str]:
+    return {name: digest for name, digest in content(folder).items() if not name.startswith(".")}
+
+
+def kill_once(name: str, folder: Path, rng: random.Random) -> str:
+    """One kill; "old or new", or what is wrong with what was left."""
+    states = []
+    for state in (0, 1):
+        WRITERS[name](folder / "fresh" / str(state), state)
+        states.append(visible(folder / "fresh" / str(state)))
+    place = folder / "killed"
+    place.mkdir()
+    command = [sys.executable, "-c", PROGRAM, str(Path(__file__).parent), name, str(place)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as program:
+        assert program.stdout is not None
+        program.stdout.readline()
+        time.sleep(rng.uniform(0, 0.2))
+        number = rng.choice(SIGNALS)
+        program.send_signal(number)
+        program.wait()
+    found = visible(place)
+    if untimed(found) not in [untimed(s) for s in states] or set(found) not in [set(s) for s in states]:
+        return f"a mixture: {sorted(found)}"
+    if name == "exports":
+        tp.read_geometry(place / "out")
+    if number != signal.SIGKILL and set(content(place)) != set(found):
+        return f"temporary files after {number.name}: {sorted(set(content(place)) - set(found))}"
+    WRITERS[name](place, 1)
+    left = {p.name for p in place.iterdir() if p.name.startswith(".")}
+    if left or untimed(visible(place)) != untimed(states[1]):
+        return f"the next run left {sorted(left)}, or another result"
+    return "old or new"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    rng = random.Random(args.seed)
+    found: Counter[str] = Counter()
+    for k in range(args.kills):
+        name = list(WRITERS)[k % len(WRITERS)]
+        with tempfile.TemporaryDirectory() as root:
+            found[f"{name}: {kill_once(name, Path(root), rng)}"] += 1
+    for what, times in found.most_common():
+        print(f"{times:5d}  {what}")
+    return int(any(not what.endswith("old or new") for what in found))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
