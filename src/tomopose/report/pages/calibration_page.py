@@ -1,4 +1,4 @@
-"""The report of a calibration: verdict first, then what was found, how well the data fit, and what they can tell."""
+"""The report of a calibration: verdict first, then what was found, how well the data fit, and what they determine."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ def _residuals(calibration: Calibration, joined: Joined) -> Section:
     return Section(
         title="How well the data fit",
         lead=f"Reprojection error {number(calibration.d_rms)} px, {number(calibration.d_rms_um)} µm at the object. A "
-        "small residual alone proves little: see what the poses can tell.",
+        "small residual alone proves little: see what the poses determine.",
         blocks=[b for b in blocks if b is not None],
     )
 

@@ -39,7 +39,7 @@ def parameters_section(calibration: Calibration) -> Section:
                 errors,
                 title="Identified errors of the manipulator",
                 words="What the model found beside the mount, as corrections of the machine's stated geometry. Errors "
-                "that the poses cannot tell stay near zero with the uncertainty of their prior.",
+                "that the poses do not determine stay near zero with the uncertainty of their prior.",
             )
         )
     facts = _facts(calibration)
