@@ -202,8 +202,8 @@ def algorithm_from(o: AlgorithmOptions) -> Algorithm | None:
             raise typer.BadParameter(f"{o.algorithm} contradicts --paper, which is sart", param_hint="--algorithm")
         return replace(PAPER, seed=o.seed or 0)
     asked = algorithm_of(o.algorithm)
-    for name in given if asked is not None else ():
-        if name not in [f.name for f in fields(asked)]:
+    for name in given:
+        if asked is not None and name not in [f.name for f in fields(asked)]:
             raise typer.BadParameter(f"{name_of(asked)} has no such option", param_hint="--" + name.replace("_", "-"))
     return with_options(asked, given)
 

@@ -175,8 +175,7 @@ def choose(asked: Algorithm | None, s: Situation, scan: LineIntegrals, limits: L
             f"sart: from zero, because FDK is not defined here: {lacking}" if lacking else "fdk+sart: FDK is the start"
         )
         return Choice(algorithm=replace(asked, start=start), words=words, redundancy=redundancy)
-    part = asked if isinstance(asked, FDK) else asked.start if isinstance(asked, SART) else None
-    assert part != "auto"
+    part = filtered_part(asked)
     if part is None:
         return Choice(algorithm=asked, words=f"{name_of(asked)}: as asked for", redundancy=None)
     if not able:
@@ -191,6 +190,13 @@ def choose(asked: Algorithm | None, s: Situation, scan: LineIntegrals, limits: L
         raise TrajectoryError(f'FDK{start} is not defined here: {obstacle}. Use algorithm="sart".{look}')
     words = f"{name_of(asked)}: as asked for" + (f", although {obstacle}" if obstacle else "")
     return Choice(algorithm=asked, words=words, redundancy=redundancy)
+
+
+def filtered_part(algorithm: Algorithm) -> FDK | None:
+    """The FDK that an algorithm is, or begins with."""
+    if isinstance(algorithm, SART):
+        return algorithm.start if isinstance(algorithm.start, FDK) else None
+    return algorithm if isinstance(algorithm, FDK) else None
 
 
 def default(s: Situation, obstacle: str, redundancy: Redundancy | None, lacking: str) -> Choice:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -132,12 +133,13 @@ def open_field(work: Work, execution: Execution) -> Field:
     """Where the volume lives while it is made: in memory, in slabs on disk, or on a cluster."""
     algorithm, grid, matrices = work.choice.algorithm, work.grid, work.scan.matrices
     options = dict(execution.engine_options)
-    if execution.client is not None:
-        workers = len(execution.client.scheduler_info(n_workers=-1)["workers"])
+    client: Any = execution.client  # dask is optional and untyped
+    if client is not None:
+        workers = len(client.scheduler_info(n_workers=-1)["workers"])
         if workers == 0:
             raise EngineError("the dask client has no workers")
         slabs = execution.slabs or workers
-        return DaskField(work.engine, matrices, grid, work.support, options, slabs=slabs, client=execution.client)
+        return DaskField(work.engine, matrices, grid, work.support, options, slabs=slabs, client=client)
     plan = memory_plan(
         matrices,
         grid,
