@@ -12,6 +12,7 @@ from tomopose.calibration.build import Fitted, build, expected_px, magnification
 from tomopose.calibration.checks.alternative import Alternative
 from tomopose.calibration.checks.convention_tests import Diagnosis, ranked, set_pose_alternative
 from tomopose.calibration.checks.conventions import ALTERNATIVES
+from tomopose.calibration.checks.placement import require_on_panel
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS
 from tomopose.calibration.model.covariance import widening
 from tomopose.calibration.model.parameters import (
@@ -228,6 +229,7 @@ def rigid_calibration(
 ) -> tuple[Calibration, FreeParameters]:
     """The calibration that trusts the poses, and what was freed; arguments as of `calibrate`."""
     problem = pair(scanner, poses, observations)
+    require_on_panel(problem)
     freed = free_parameters(problem.scanners, free=free, fix=fix, priors=priors)
     stated = solve(problem, freed, robust=robust)
     solution = with_pose_noise(stated, pose_noise, robust=robust)

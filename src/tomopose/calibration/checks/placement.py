@@ -9,7 +9,11 @@ import numpy as np
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.rigid.estimate import LIKELY
 from tomopose.calibration.rigid.fit import Fit
+from tomopose.errors import InputError
 from tomopose.units import Array
+
+OUTSIDE = 0.1
+"""Of the panel's larger side: the centre of a ball of which half the rim is seen is outside by less than its radius."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +67,22 @@ def placement(problem: Problem, fit: Fit) -> Placement:
         d_SD=min(s.d_SD for s in problem.scanners),
         d_SR=first.d_SR,
     )
+
+
+def require_on_panel(problem: Problem) -> None:
+    """InputError for a centre that is farther outside the panel than a ball that is partly seen can be."""
+    for r, scanner in enumerate(problem.scanners):
+        size = np.array([scanner.n_u, scanner.n_v], dtype=np.float64)
+        x = problem.x_D
+        outside = np.maximum(-x, x - (size - 1.0)).max(axis=1)
+        off = np.flatnonzero((problem.run == r) & (outside > OUTSIDE * size.max()))
+        if off.size:
+            k = int(off[0])
+            raise InputError(
+                f"{off.size} of {len(problem)} centres are not on the panel: that of pose {problem.pose_id[k]!r} is "
+                f"({x[k, 0]:.6g}, {x[k, 1]:.6g}) px, the panel has {scanner.n_u} x {scanner.n_v} pixels; check n_u_px, "
+                "n_v_px and binning in scanner.json, and that u_px and v_px are pixels"
+            )
 
 
 def better_placed(other: Placement, declared: Placement) -> bool:

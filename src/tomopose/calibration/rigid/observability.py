@@ -79,11 +79,26 @@ def singular_values(J: Array) -> tuple[Array, Array]:
     return s, Vt / np.where(norm > 0, norm, 1.0)
 
 
+MOST_TERMS = 6
+"""A direction of more coordinates than this is told by their groups: ten balls alone have thirty coordinates."""
+
+
+def _group(name: str) -> str:
+    if name.startswith("w_HT"):
+        return "R_HT"
+    if name.startswith("t_HT"):
+        return "t_HT"
+    return "the places of the balls" if name.startswith("t[") else "t" if name.startswith("t_") else base_name(name)
+
+
 def _words(names: tuple[str, ...], v: Array) -> str:
-    """A direction as "t_HT_x + 0.9 d_SR"."""
+    """A direction as "t_HT_x + 0.9 d_SR", or as the groups that move together where it has many coordinates."""
     size = v / scales(names)
     top = np.abs(size).max()
     terms = [(n, x) for n, x in zip(names, v, strict=True) if abs(x) / scales((n,))[0] >= SHOWN * top]
+    if len(terms) > MOST_TERMS:
+        groups = list(dict.fromkeys(_group(n) for n, _ in terms))
+        return f"{', '.join(groups[:-1])} and {groups[-1]} together" if len(groups) > 1 else f"{groups[0]} together"
     unit = max(abs(x) for _, x in terms)
     return " ".join(f"{'-' if x < 0 else '+'} {abs(x) / unit:.2g} {n}" for n, x in terms).lstrip("+ ")
 
