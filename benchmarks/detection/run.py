@@ -73,7 +73,7 @@ def corrected(centre: np.ndarray, semi_minor: float, scanner: Scanner, origin: t
 
 
 def our_centre(image: np.ndarray, scanner: Scanner, origin: tuple[int, int]) -> np.ndarray:
-    return detect_image(image, scanner, origin=origin).x_D
+    return detect_image(image, scanner, origin=origin, ball_diameter=8.0).x_D
 
 
 def rms(error: np.ndarray) -> float:
@@ -93,7 +93,7 @@ def against_the_bound(crops: int, magnifications: list[float]) -> None:
             for k in range(crops):
                 i = k % len(scenes)
                 ball = detect_image(noisy(clean[i], snr, rng, white=30000.0), scenes[i].scanner,
-                                    origin=(boxes[i]["u"], boxes[i]["v"]))  # fmt: skip
+                                    origin=(boxes[i]["u"], boxes[i]["v"]), ball_diameter=8.0)  # fmt: skip
                 d = ball.x_D - scenes[i].x_D
                 error.append(d / np.sqrt(unit[i] / snr**2))
                 squares.append(d @ np.linalg.solve(ball.covariance, d) / 2)
@@ -144,7 +144,7 @@ def other_images(crops: int) -> None:
             scanner, u, v, x = scenes[k].scanner, boxes[k]["u"], boxes[k]["v"], scenes[k].x_D
             if name.startswith("binned"):
                 scanner, u, v, x = scanner.binned(2), u // 2, v // 2, (x - 0.5) / 2
-            ball = detect_image(image(k), scanner, origin=(u + (42 if "view" in name else 0), v))
+            ball = detect_image(image(k), scanner, origin=(u + (42 if "view" in name else 0), v), ball_diameter=8.0)
             d = ball.x_D - x
             error.append(d)
             squares.append(d @ np.linalg.solve(ball.covariance, d) / 2)
@@ -208,22 +208,24 @@ def speed(frames: int) -> None:
         v, u, half = round(scene.x_D[1]), round(scene.x_D[0]), 183
 
         def tracked() -> None:
-            detect(images, scene.scanner, predicted=predicted)
+            detect(images, scene.scanner, predicted=predicted, ball_diameter=8.0)
 
         def regions() -> None:
             for i in range(frames):
                 images.region(i, v - half, v + half, u - half, u + half)
 
-        detect(images, scene.scanner)
+        detect(images, scene.scanner, ball_diameter=8.0)
         tracked()
         read = seconds(lambda: [images[i] for i in range(frames)], cpu) / frames
-        full = seconds(lambda: detect(images, scene.scanner), cpu) / frames
+        full = seconds(lambda: detect(images, scene.scanner, ball_diameter=8.0), cpu) / frames
         region, track = seconds(regions, cpu) / frames, seconds(tracked, cpu) / frames
         cold = seconds(regions, clock, folder) / frames
         cold_track = seconds(tracked, clock, folder) / frames
         with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
-            detect(images, scene.scanner, executor=pool)  # starts the processes and loads their kernels
-            wall = seconds(lambda: detect(images, scene.scanner, executor=pool), clock) / frames
+            detect(
+                images, scene.scanner, executor=pool, ball_diameter=8.0
+            )  # starts the processes and loads their kernels
+            wall = seconds(lambda: detect(images, scene.scanner, executor=pool, ball_diameter=8.0), clock) / frames
     say("2048 x 2048 TIFF: read alone", f"{1e3 * read:.1f} ms CPU a frame")
     say("2048 x 2048 TIFF: read + find + fit", f"{1e3 * full:.1f} ms CPU = {full / read:.1f} x reading; "
         f"2 cores: {2 / full:.0f} a second by CPU time, {1 / wall:.0f} by the clock",
@@ -252,7 +254,7 @@ def memory(frames_in_all: int) -> None:
         for _ in range(frames_in_all):
             yield image.copy()
 
-    seen = detect(frames(), scanner, workers=1).seen.sum()
+    seen = detect(frames(), scanner, workers=1, ball_diameter=8.0).seen.sum()
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
     print(f"{peak:.0f} MiB ({after_setup:.0f} before the first frame), {seen} seen")
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 import tomopose as tp
@@ -45,7 +48,7 @@ def words(folder, verb, out, *more):
 
 def test_detect_writes_a_row_for_each_radiograph_and_names_the_missing_flat_field(radiographs, tmp_path, capsys):
     out = tmp_path / "observations.csv"
-    assert run(words(radiographs, "detect", out)) == 0
+    assert run(words(radiographs, "detect", out, "--ball-diameter-mm", str(DIAMETER))) == 0
     said = capsys.readouterr()
     assert "8 of 8 balls measured" in said.out
     assert "no flat field given" in said.err
@@ -60,5 +63,30 @@ def test_diameter_that_contradicts_the_calibration_stops_before_anything_is_writ
     assert "than a ball of 7.6 mm would throw" in capsys.readouterr().err
     assert not wrong.exists()
     # the right one is calibrated, if doubtful with so few poses
-    assert run(words(radiographs, "calibrate", tmp_path / "right", "--quiet")) == 3
+    assert run(words(radiographs, "calibrate", tmp_path / "right", "--ball-diameter-mm", str(DIAMETER), "--quiet")) == 3
     assert (tmp_path / "right" / "calibration.json").exists()
+
+
+def test_the_diameter_has_no_default(radiographs, tmp_path, capsys):
+    for verb in ("detect", "calibrate"):
+        assert run(words(radiographs, verb, tmp_path / "out")) == 2
+        assert "--ball-diameter-mm" in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()
+    assert run(words(radiographs, "detect", tmp_path / "out", "--ball-diameter-mm", "0=8,x")) == 2
+    assert "ID=MM" in capsys.readouterr().err
+
+
+def test_balls_of_two_sizes_and_predicted_places(radiographs, tmp_path):
+    """The pose table names the ball of each row; a table of places limits the search to regions."""
+    poses, out = tmp_path / "poses.csv", tmp_path / "observations.csv"
+    sequence = tp.read_poses(radiographs / "poses.csv")
+    tp.write_poses(poses, replace(sequence, ball_id=np.full(len(sequence), 4)))
+    command = words(radiographs, "detect", out, "--ball-diameter-mm", f"4={DIAMETER},9={3 * DIAMETER}", "--quiet")
+    command[command.index("--poses") + 1] = str(poses)
+    assert run(command) == 0
+    by_size = tp.read_observations(out)
+    assert by_size.seen.all()
+    again = words(radiographs, "detect", tmp_path / "b.csv", "--ball-diameter-mm", str(DIAMETER), "--quiet")
+    assert run([*again, "--predicted", str(out)]) == 0
+    predicted = tp.read_observations(tmp_path / "b.csv")
+    assert np.abs(predicted.x_D - by_size.x_D).max() < 0.01

@@ -29,7 +29,7 @@ def small() -> list[Crop]:
 
 def measured(crop: Crop, image: Array) -> BallImage:
     scene, box, _ = crop
-    return detect_image(image, scene.scanner, origin=(box["u"], box["v"]))
+    return detect_image(image, scene.scanner, origin=(box["u"], box["v"]), ball_diameter=8.0)
 
 
 def normalised(found: list[tuple[BallImage, Array]]) -> Array:

@@ -154,7 +154,9 @@ def test_images_are_not_corrected_twice(scene: Scene, good: np.ndarray, tmp_path
     files(tmp_path, [good / np.float32(WHITE)])
     flat = np.full(SHAPE, WHITE)
     with pytest.raises(InputError, match="corrected"):
-        detect(tp.open_images(tmp_path, scene.scanner, flat=flat, dark=np.zeros(SHAPE)), scene.scanner)
+        detect(
+            tp.open_images(tmp_path, scene.scanner, flat=flat, dark=np.zeros(SHAPE)), scene.scanner, ball_diameter=8.0
+        )
 
 
 def test_saturated_and_starved_images(scene: Scene, clean: Array) -> None:

@@ -23,7 +23,7 @@ def gvxr(shared_data: Path) -> tuple[BallObservations, Array, Array]:
                       u_0=known["u_0_px"], v_0=known["v_0_px"], n_u=known["n_u_px"], n_v=known["n_v_px"])  # fmt: skip
     poses = json.loads((folder / "truth.json").read_text())["poses"]
     files = sorted((folder / "radiographs").glob("*.tif"))
-    observations = detect((tifffile.imread(f)[::-1] for f in files), scanner)
+    observations = detect((tifffile.imread(f)[::-1] for f in files), scanner, ball_diameter=8.0)
     truth = np.array([[p["u_px"], p["v_px"]] for p in poses])
     ellipse = np.array([[p["u_ellipse_px"], p["v_ellipse_px"]] for p in poses])
     return observations, truth, ellipse

@@ -39,7 +39,7 @@ def test_refused_image_is_freed_at_once():
 
     gc.disable()
     try:
-        observed = tp.detect(images(), SCANNER)
+        observed = tp.detect(images(), SCANNER, ball_diameter=8.0)
         assert not observed.seen.any()
         assert kept[0]() is None
     finally:

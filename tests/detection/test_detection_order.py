@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tomopose.detection.rim_fit.order_statistics import median, select
+from tomopose.detection.order_statistics import median, select
 
 RNG = np.random.default_rng(4)
 SAMPLES = {

@@ -10,11 +10,13 @@ from ball_images import Scene, noise_free, noisy, standard_scene, window
 from scipy.ndimage import gaussian_filter
 
 from tomopose.detection import detect_image
-from tomopose.detection.rim_fit.noise import correlation, evident, sandwich
-from tomopose.detection.rim_fit.sector_test import PARTS, changes, trust
+from tomopose.detection.rim_fit.noise import correlation, excess_variance, sandwich
+from tomopose.detection.rim_fit.sector_test import kept_weight, model_change
+from tomopose.detection.settings import DEFAULT, NoiseSettings
 from tomopose.units import Array
 
 SIZE = 60
+PARTS, RARE = DEFAULT.sector_test.parts, DEFAULT.noise.rare
 V, U = np.mgrid[:SIZE, :SIZE].reshape(2, -1).astype(float)
 
 
@@ -26,7 +28,7 @@ def scintillator(seed: int, blur: float = 0.6) -> Array:
 
 def test_white_noise_has_no_correlation() -> None:
     for seed in range(20):
-        rho = correlation(U, V, np.random.default_rng(seed).normal(size=U.size))
+        rho = correlation(U, V, np.random.default_rng(seed).normal(size=U.size), NoiseSettings())
         assert np.count_nonzero(rho) == 1
         assert rho.sum() == 1.0
 
@@ -36,7 +38,7 @@ def test_correlation_of_a_scintillator() -> None:
     g = np.zeros((21, 21))
     g[10, 10] = 1.0
     truth = 1.0 / float((gaussian_filter(g, 0.6) ** 2).sum())
-    found = [correlation(U, V, scintillator(seed).ravel()).sum() for seed in range(10)]
+    found = [correlation(U, V, scintillator(seed).ravel(), NoiseSettings()).sum() for seed in range(10)]
     assert np.mean(found) == pytest.approx(truth, rel=0.06)
     assert np.ptp(found) < 0.5 * truth
 
@@ -45,7 +47,7 @@ def test_sandwich_is_the_variance_of_weighted_sums() -> None:
     rng = np.random.default_rng(2)
     influence = np.stack([np.cos(U / 7.0), np.sin(V / 9.0)], axis=1) * rng.uniform(0.5, 1.5, U.size)[:, None]
     influence[(U < 8) | (V < 8) | (U > SIZE - 9) | (V > SIZE - 9)] = 0.0
-    rho = correlation(U, V, scintillator(0).ravel())
+    rho = correlation(U, V, scintillator(0).ravel(), NoiseSettings())
     sums = np.array([influence.T @ scintillator(seed).ravel() for seed in range(1, 1000)])
     found = sandwich(U, V, influence, rho)
     assert np.diag(found) == pytest.approx(sums.var(axis=0), rel=0.15)
@@ -56,11 +58,11 @@ def test_sandwich_is_the_variance_of_weighted_sums() -> None:
 
 
 def test_what_chance_may_do_does_not_count() -> None:
-    assert evident(0.9, 100.0) == 1.0
-    assert evident(1.1, 100.0) < 1.01
-    assert evident(3.0, 100.0) == pytest.approx(3.0, rel=1e-6)
+    assert excess_variance(0.9, 100.0, RARE) == 1.0
+    assert excess_variance(1.1, 100.0, RARE) < 1.01
+    assert excess_variance(3.0, 100.0, RARE) == pytest.approx(3.0, rel=1e-6)
     squares = np.random.default_rng(3).chisquare(200.0, 4000) / 200.0
-    assert np.mean([evident(x, 200.0) for x in squares]) < 1.005
+    assert np.mean([excess_variance(x, 200.0, RARE) for x in squares]) < 1.005
 
 
 def shares(*, offset: float = 0.0, scale: float = 1.0, noise: float = 1.0) -> Array:
@@ -69,7 +71,8 @@ def shares(*, offset: float = 0.0, scale: float = 1.0, noise: float = 1.0) -> Ar
     left = (along // 9).astype(np.int64).ravel()
     residual = scale * np.random.default_rng(4).normal(size=left.size) + offset * (left == 5)
     part = (along % 9 / 9).ravel()
-    return np.asarray(trust(s.ravel(), left, part, residual, np.ones(left.size), 12, 2.5, noise))
+    cells = (DEFAULT.sector_test.cell, PARTS, RARE)
+    return np.asarray(kept_weight(s.ravel(), left, part, residual, 12, cells, 2.5, noise))
 
 
 def test_a_sector_that_misfits_loses_its_weight() -> None:
@@ -90,7 +93,7 @@ def test_changes_of_the_model() -> None:
         + jacobian[11:, i] @ step[8 + 3 * ((node + 1) % k) : 11 + 3 * ((node + 1) % k)]
         for i, node in enumerate(left)
     ]
-    assert changes(jacobian, left, step, k) == pytest.approx(np.array(expected))
+    assert model_change(jacobian, left, step, k) == pytest.approx(np.array(expected))
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +110,9 @@ def test_sigma_is_honest_where_no_smooth_background_fits(tilted: tuple[Scene, di
     rng = np.random.default_rng(6)
     squares = []
     for _ in range(40):
-        ball = detect_image(noisy(clean, 800, rng, white=30000.0), scene.scanner, origin=(box["u"], box["v"]))
+        ball = detect_image(
+            noisy(clean, 800, rng, white=30000.0), scene.scanner, origin=(box["u"], box["v"]), ball_diameter=8.0
+        )
         d = ball.x_D - scene.x_D
         squares.append(d @ np.linalg.solve(ball.covariance, d) / 2)
     assert 0.3 < np.mean(squares) < 1.6
@@ -117,5 +122,5 @@ def test_a_holders_edge_is_no_correlated_noise(tilted: tuple[Scene, dict[str, in
     scene, box, clean = tilted
     rng = np.random.default_rng(7)
     images = [noisy(clean, 200, rng, white=30000.0) for _ in range(10)]
-    found = [detect_image(image, scene.scanner, origin=(box["u"], box["v"])) for image in images]
+    found = [detect_image(image, scene.scanner, origin=(box["u"], box["v"]), ball_diameter=8.0) for image in images]
     assert sum(ball.correlated for ball in found) <= 1

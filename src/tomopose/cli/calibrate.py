@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from tomopose.manipulator.twin_file import TwinDrawing
 
 EPILOG = (
-    "Example: tomopose calibrate --scanner scanner.json --poses poses.csv --images radiographs/ --out cal/\n\n"
+    "Example: tomopose calibrate --scanner scanner.json --poses poses.csv --images radiographs/ --ball-diameter-mm 8 "
+    "--out cal/\n\n"
     "C-arm: tomopose calibrate --arrangement moving-scanner --manipulator robot.json --scanner scanner.json --poses "
     "poses.csv --observations observations.csv --out cal/\n\n"
     "Twin robots: tomopose calibrate --twin twin.json --poses detector.csv --source-poses source.csv --scanner "
     "scanner.json --observations observations.csv --out cal/"
 )
-USUAL_BALL_MM = 8.0
 ARRANGEMENTS = ("moving-object", "moving-scanner")
 
 SCALE_BAR = re.compile(r"(?P<a>\d+),(?P<b>\d+)=(?P<mm>\d+\.?\d*)\((?P<u>\d*\.?\d+)\)")
@@ -163,9 +163,7 @@ def read_inputs(o: CalibrationOptions) -> Inputs:
             dark=o.dark, flat=o.flat, dataset=o.dataset, rows=o.rows, raw=o.raw,
         )  # fmt: skip
         note_missing_flat(o.say, o.flat)
-        observations = observe(
-            o.say, scanner, images, poses, ball_diameter=o.ball_diameter or USUAL_BALL_MM, workers=o.workers
-        )
+        observations = observe(o.say, scanner, images, poses, ball_diameter=o.ball_diameter, workers=o.workers)
     return Inputs(
         scanner=scanner, poses=poses, observations=observations, images=images, manipulator=manipulator, twin=twin
     )

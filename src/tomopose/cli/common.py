@@ -46,7 +46,6 @@ RawOption = Annotated[
     str | None, typer.Option("--raw", help="Layout of RAW files, NVxNU:TYPE[:HEADER_BYTES], e.g. 2048x2048:<u2:512.")
 ]
 DaskOption = Annotated[str | None, typer.Option("--dask", help="Address of a dask scheduler to use.")]
-BallOption = Annotated[float, typer.Option("--ball-diameter-mm", help="Nominal diameter of the ball, mm.")]
 
 
 IN_ASCII = {"µ": "u", "−": "-", "–": "-", "×": "x", "°": " deg", "±": "+-", "σ": "sigma", "²": "2", "…": "..."}

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tomopose.cli.common import (
     OK,
-    BallOption,
     DarkOption,
     DaskOption,
     DatasetOption,
@@ -24,7 +23,14 @@ from tomopose.cli.common import (
     WorkersOption,
 )
 
-EPILOG = "Example: tomopose detect --scanner scanner.json --images 'run/*.tif' --poses poses.csv --out observations.csv"
+if TYPE_CHECKING:
+    from tomopose import ImageSequence, PoseSequence
+    from tomopose.units import Array
+
+EPILOG = (
+    "Example: tomopose detect --scanner scanner.json --images 'run/*.tif' --poses poses.csv --ball-diameter-mm 8 "
+    "--out observations.csv"
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -35,10 +41,20 @@ def detect(
     scanner: ScannerOption,
     images: Annotated[str, typer.Option("--images", help="Folder, glob or multi-page file of radiographs.")],
     out: Annotated[Path, typer.Option("--out", help="observations.csv to write.")],
+    ball_diameter: Annotated[
+        str,
+        typer.Option(
+            "--ball-diameter-mm",
+            help="Nominal diameter of the ball, mm; with several balls in an image ID=MM,ID=MM (ids of --poses).",
+        ),
+    ],
     poses: Annotated[
         Path | None, typer.Option("--poses", help="poses.csv; gives the pose ids. Without it: the images' names.")
     ] = None,
-    ball_diameter: BallOption = 8.0,
+    predicted: Annotated[
+        Path | None,
+        typer.Option("--predicted", help="Table like observations.csv: where each pose's ball should be."),
+    ] = None,
     dark: DarkOption = None,
     flat: FlatOption = None,
     dataset: DatasetOption = None,
@@ -69,13 +85,19 @@ def detect(
         say, image_source(images), geometry, sequence, dark=dark, flat=flat, dataset=dataset, rows=rows, raw=raw
     )
     note_missing_flat(say, flat)
+    sizes = diameters(ball_diameter)
+    several = isinstance(sizes, dict)
+    if several and sequence is None:
+        raise typer.BadParameter("several balls need --poses with a row for each image and ball", param_hint="--poses")
     with executor_of(dask) as executor:
         found = observe(
             say,
             geometry,
             stack,
             sequence,
-            ball_diameter=ball_diameter,
+            ball_diameter=sizes,
+            ball_id=sequence.ball_id if several and sequence is not None else None,
+            predicted=None if predicted is None else places(predicted, stack, sequence),
             workers=workers,
             executor=executor,
             journal=resume,
@@ -87,3 +109,31 @@ def detect(
         [f"{out}: {int(found.seen.sum())} of {len(found)} balls measured", *(f"  {k}: {v}" for k, v in missed.items())],
     )
     return OK
+
+
+def diameters(text: str) -> float | dict[int, float]:
+    """`8` or `0=8,1=5`: one diameter, or one for each ball id, mm."""
+    try:
+        if "=" not in text:
+            return float(text)
+        pairs = [part.split("=") for part in text.split(",")]
+        found = {int(ball): float(mm) for ball, mm in pairs}
+    except ValueError as error:
+        raise typer.BadParameter(
+            f"{text!r} is neither a number of mm nor ID=MM,ID=MM", param_hint="--ball-diameter-mm"
+        ) from error
+    if len(found) != len(pairs):
+        raise typer.BadParameter(f"{text!r} names a ball twice", param_hint="--ball-diameter-mm")
+    return found
+
+
+def places(path: Path, images: ImageSequence, poses: PoseSequence | None) -> Array:
+    """(n, 2) px where the ball of each image should be, by pose id; NaN for one that the table does not have."""
+    import numpy as np
+
+    import tomopose as tp
+
+    table = tp.read_observations(path)
+    at = {name: table.x_D[k] for k, name in enumerate(table.pose_id)}
+    ids = [Path(name).stem for name in images.names] if poses is None else poses.pose_id
+    return np.array([at.get(i, (np.nan, np.nan)) for i in ids], dtype=np.float64).reshape(-1, 2)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -110,19 +110,22 @@ def observe(
     images: Any,
     poses: PoseSequence | None,
     *,
-    ball_diameter: float,
+    ball_diameter: float | Mapping[int, float] | None,
     workers: int = 1,
     **options: Any,
 ) -> BallObservations:
     """Find the ball in each image.  Without poses the ids are the images' names without suffix."""
     import tomopose as tp
 
+    if ball_diameter is None:
+        raise typer.BadParameter("give the ball's nominal diameter, mm", param_hint="--ball-diameter-mm")
     ids = [Path(name).stem for name in images.names] if poses is None else poses.pose_id
     with say.progress("detecting") as progress:
         found = tp.detect(
             images, scanner, ball_diameter=ball_diameter, pose_id=ids, workers=workers, progress=progress, **options
         )
-    return replace(found, image=tuple(Path(name).name for name in images.names), ball_diameter=ball_diameter)
+    only = None if isinstance(ball_diameter, Mapping) else ball_diameter
+    return replace(found, image=tuple(Path(name).name for name in images.names), ball_diameter=only)
 
 
 def worst(calibration: Calibration, observations: BallObservations, images: Any) -> tuple[Thumbnail, ...]:

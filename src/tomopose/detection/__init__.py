@@ -3,5 +3,6 @@
 from tomopose.detection.image import detect_image
 from tomopose.detection.result import BallImage
 from tomopose.detection.run.detect import detect
+from tomopose.detection.settings import DetectionSettings
 
-__all__ = ["BallImage", "detect", "detect_image"]
+__all__ = ["BallImage", "DetectionSettings", "detect", "detect_image"]

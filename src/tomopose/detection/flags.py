@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
-from tomopose.detection.rim_fit.cone import ring_pixels
-from tomopose.detection.rim_fit.fit import ConeFit
+from tomopose.detection.rim_fit.covariance import ConeFit
+from tomopose.detection.rim_model.ring import BallWindow, annulus_pixels
+from tomopose.detection.settings import DetectionSettings, FlagSettings
 from tomopose.errors import DetectionError
 from tomopose.geometry.scanner import Scanner
 from tomopose.units import Array
@@ -26,36 +28,24 @@ FLAGS = {
     "lag": "the previous pose's ball is still faintly visible",
 }
 
-WHOLE_RIM = 0.985
-LOST = 0.01
-SATURATED, MOSTLY_SATURATED = 0.02, 0.3
-NOISE_FREE = 1e-4
-"""Noise, in contrasts, below which an image counts as computed without noise."""
-FEW = 15.0
-DOUBTED = 0.4
-"""Share of the centre's variance from which edges at the rim are worth a word."""
-OFF_NOMINAL = 0.2
-MOTION = 0.5
-"""Shortest motion that is called so, px: a uniform motion by L adds L^2 / 12 to the blur's variance along it."""
-MOTION_CHI2 = 30.0
 
-
-def saturated_share(window: Array, ceiling: float, fit: ConeFit, origin: tuple[int, int]) -> float:
-    """Share of the pixels just outside the rim that stand at the image's largest value, where that is a clipped one.
+def saturated_share(window: BallWindow, ceiling: float, fit: ConeFit, settings: FlagSettings) -> float:
+    """Share of the pixels just outside the rim that have the image's largest value, where that is a clipped one.
 
     Counts clip at a power of two less 1; of other values that many alike are clipped too,
     unless the image is a simulated one without noise.
     """
-    u, v, radius, sigma = (float(x) for x in fit.shape[:4])
-    every_one = np.ones(window.shape, dtype=bool)
-    low, high = radius + 2.5 * sigma, radius + 12.0
-    *_, ring = ring_pixels(window, every_one, origin[0], origin[1], u, v, low, high, 1.0, 1.0, 1)
+    radius, blur = float(fit.shape[2]), float(fit.shape[3])
+    low = radius + 2.5 * blur
+    ring = annulus_pixels(
+        replace(window, good=np.ones_like(window.good)), fit.shape, low, max(radius + 12.0, low + 5.0)
+    )
     if ring.size == 0 or not math.isfinite(ceiling):
         return 0.0
     share = float((ring >= ceiling).mean())
     power_of_two = ceiling >= 255 and float(np.log2(ceiling + 1)).is_integer()
-    noisy = max(fit.noise_in, fit.noise_out) > NOISE_FREE * abs(fit.level - fit.white)
-    return share if power_of_two or (share > MOSTLY_SATURATED and noisy) else 0.0
+    noisy = math.sqrt(max(fit.noise.inside, fit.noise.outside)) > settings.noise_free * fit.contrast
+    return share if power_of_two or (share > settings.mostly_saturated and noisy) else 0.0
 
 
 def expected_radius(scanner: Scanner, ball_diameter: float) -> float:
@@ -63,28 +53,33 @@ def expected_radius(scanner: Scanner, ball_diameter: float) -> float:
     return ball_diameter / 2 * scanner.magnification / math.sqrt(scanner.p_u * scanner.p_v)
 
 
-def motion_length(anisotropy: Array, covariance: Array) -> float:
-    """Length of the motion that would explain the blur's anisotropy, px; 0 where it is within its noise."""
+def motion_length(anisotropy: Array, covariance: Array, blur: float, settings: DetectionSettings) -> float:
+    """Length of the motion that would explain the blur's anisotropy, px; 0 where it is within its noise, or short."""
     significance = float(anisotropy @ np.linalg.solve(covariance, anisotropy))
-    return math.sqrt(24.0 * math.hypot(*anisotropy)) if significance > MOTION_CHI2 else 0.0
+    length = math.sqrt(24.0 * math.hypot(*anisotropy))
+    shortest = max(settings.flags.motion, settings.flags.motion_widths * blur)
+    return length if significance > settings.fit.moved and length > shortest else 0.0
 
 
-def flags_of(fit: ConeFit, *, saturated: float, expected: float, bright: bool, eight_bit: bool) -> tuple[str, ...]:
+def flags_of(
+    fit: ConeFit, *, saturated: float, expected: float, bright: bool, eight_bit: bool, settings: DetectionSettings
+) -> tuple[str, ...]:
     """The flags of one fit; DetectionError where the rim is mostly saturated or lost."""
-    if saturated > MOSTLY_SATURATED:
+    limits = settings.flags
+    if saturated > limits.mostly_saturated:
         raise DetectionError(
             f"saturated rim: {100 * saturated:.0f} % of the background along the rim is clipped; lower the exposure"
         )
-    if fit.lost > 0.5:
+    if fit.lost > limits.most_lost:
         raise DetectionError(f"bad pixels on the rim: {100 * fit.lost:.0f} % of its pixels cannot be used")
-    moved = motion_length(fit.anisotropy, fit.anisotropy_covariance) > MOTION
+    moved = motion_length(*fit.anisotropy, float(fit.shape[3]), settings) > 0
     present = {
-        "truncated": fit.visible < WHOLE_RIM,
-        "bad pixels on the rim": fit.lost > LOST,
-        "saturated": saturated > SATURATED,
-        "few photons": fit.snr < FEW,
-        "edge at the rim": fit.doubt > DOUBTED and not moved,
-        "radius off nominal": abs(fit.shape[2] / expected - 1.0) > OFF_NOMINAL,
+        "truncated": fit.visible < limits.whole_rim,
+        "bad pixels on the rim": fit.lost > limits.lost,
+        "saturated": saturated > limits.saturated,
+        "few photons": fit.snr < limits.few,
+        "edge at the rim": fit.doubt > limits.doubted and not moved,
+        "radius off nominal": abs(fit.shape[2] / expected - 1.0) > limits.off_nominal,
         "moved": moved,
         "bright ball": bright,
         "8-bit": eight_bit,

@@ -7,35 +7,22 @@ found in, then on a finer one of its surroundings.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from tomopose.detection.finder.circle import check_circle
+from tomopose.detection.finder.circle import STEP, WIDE, check_circle, rim_blur
 from tomopose.detection.finder.symmetry_votes import BANDS, LARGEST, SMALLEST, block_mean, circle_centres
+from tomopose.detection.settings import FinderSettings
 from tomopose.errors import AmbiguousBallError, BallNotFoundError, BallTruncatedError
 from tomopose.units import Array
 
-COMPLETE = 0.62
-"""Least share of the visible rim that must agree with a circle."""
-FAINT = 0.4
-"""A candidate with less than this share of the best one's contrast is no rival."""
-EQUAL = 0.75
-"""A second candidate with this share of the best one's merit makes the image ambiguous."""
-ROUND, FINE_ROUND = 0.08, 0.03
-"""Deviation from a circle, in radii, that a ray may show on a coarse and on the fine level: a hexagon has 0.07."""
-FINALISTS = 4
-SURE = 0.85
-"""Least share of the rim of a circle at a predicted place that makes further search needless."""
-CONVINCING = 0.6
-"""Merit from which a candidate ends the search."""
-SIZES = 1.6
-"""Ratio to the expected radius, either way, of a ball that is looked for first."""
 BLUNT = 1.15
 """Ratio beyond a level's radii of circles that are still seen on it; with it one level holds all between
-expected_radius / SIZES and expected_radius SIZES, for levels follow by 2 and LARGEST / SMALLEST BLUNT^2 > 2 SIZES^2."""
-PRIOR = 0.25
-"""Width of the preference for the nominal radius, in log radius: loose, for magnification varies with the pose."""
+expected_radius / size_ratio and expected_radius size_ratio, for levels follow by 2 and LARGEST / SMALLEST BLUNT^2 >
+2 size_ratio^2."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +30,7 @@ class Candidate:
     """A circle in the image: centre (u, v) and radius in px of the image given, share of rays that agree, contrast.
 
     bright: whether it is brighter than its surroundings.  visible: share of its rays that reach the rim in the image.
+    blur: about the standard deviation of its rim's blur, px.
     """
 
     u: float
@@ -52,6 +40,7 @@ class Candidate:
     visible: float
     contrast: float
     bright: bool
+    blur: float = 0.0
     merit: float = 0.0
 
     def overlaps(self, other: Candidate) -> bool:
@@ -63,8 +52,9 @@ def find_ball(
     expected_radius: float,
     aspect: float = 1.0,
     *,
-    smallest: float = 3.5,
     near: tuple[float, float] | None = None,
+    others: Sequence[float] = (),
+    settings: FinderSettings,
 ) -> tuple[Candidate, tuple[Candidate, ...]]:
     """The ball and all candidates, best first.
 
@@ -73,119 +63,180 @@ def find_ball(
     image:            [v, u], finite; bad pixels filled.
     expected_radius:  px in u; other radii are found as well, but a ball of about this radius is preferred.
     aspect:           p_v / p_u: a circle on the detector is lower by this factor in rows.
-    near:             predicted (u, v): of several candidates the one nearest to it is meant.
+    near:             predicted (u, v): of several candidates the nearest one to it is meant.
+    others:           expected radii of other balls in the image, px in u: without a prediction the size decides.
 
     Raises
     ------
     BallNotFoundError, BallTruncatedError, AmbiguousBallError
     """
-    candidates = [] if near is None else _predicted(image, near, expected_radius, aspect)
-    candidates = candidates or _candidates(image, expected_radius, aspect, smallest)
+    search = _Search(image, expected_radius, aspect, settings)
+    candidates = [] if near is None else _predicted(search, near)
+    candidates = candidates or _candidates(search, every=bool(others))
+    if others and near is None:
+        candidates = _of_its_size(candidates, expected_radius, others)
     best = candidates[0]
+    likely = [c for c in candidates if _is_alternative(c, best, settings)]
     if near is not None:
-        likely = [c for c in candidates if c.merit > EQUAL * best.merit and c.contrast > FAINT * best.contrast]
         best = min(likely, key=lambda c: math.hypot(c.u - near[0], c.v - near[1]))
-    if best.visible < 0.4:
-        raise BallTruncatedError(
-            f"the ball at ({best.u:.0f}, {best.v:.0f}), radius {best.radius:.0f} px, shows only "
-            f"{100 * best.visible:.0f} % of its rim; at least half is needed"
-        )
-    for other in candidates:
-        if near is not None or other is best:
-            continue
-        if other.merit > EQUAL * best.merit and other.contrast > FAINT * best.contrast and not other.overlaps(best):
+    refuse_hidden(best, settings)
+    for other in likely if near is None else ():
+        if other is not best and not other.overlaps(best):
             raise AmbiguousBallError(
                 f"two shapes could be the ball: at ({best.u:.0f}, {best.v:.0f}), radius {best.radius:.0f} px, and at "
-                f"({other.u:.0f}, {other.v:.0f}), radius {other.radius:.0f} px; give a predicted position or crop"
+                f"({other.u:.0f}, {other.v:.0f}), radius {other.radius:.0f} px; give a predicted position, crop, or "
+                "name all balls with their diameters"
             )
     return best, tuple(candidates)
 
 
-def _predicted(
-    image: Array, near: tuple[float, float], expected_radius: float, aspect: float
-) -> list[Candidate]:  # fmt: skip
+def _of_its_size(found: list[Candidate], expected: float, others: Sequence[float]) -> list[Candidate]:
+    """The candidates whose radius is nearer to the expected one than to that of another ball in the image."""
+
+    def off(c: Candidate, radius: float) -> float:
+        return abs(math.log(c.radius / radius))
+
+    own = [c for c in found if all(off(c, expected) < off(c, other) for other in others)]
+    if not own:
+        shown = ", ".join(f"({c.u:.0f}, {c.v:.0f}) radius {c.radius:.0f} px" for c in found[:4])
+        raise BallNotFoundError(
+            f"no circle is nearer to the expected radius of {expected:.0f} px than to that of another ball; "
+            f"found: {shown}"
+        )
+    return own
+
+
+def refuse_hidden(best: Candidate, settings: FinderSettings) -> None:
+    """BallTruncatedError where too little of the rim is visible."""
+    if best.visible < settings.least_visible:
+        raise BallTruncatedError(
+            f"the ball at ({best.u:.0f}, {best.v:.0f}), radius {best.radius:.0f} px, shows only "
+            f"{100 * best.visible:.0f} % of its rim; at least half is needed"
+        )
+
+
+class _Search(NamedTuple):
+    image: Array
+    expected: float
+    aspect: float
+    settings: FinderSettings
+
+
+def _is_alternative(c: Candidate, best: Candidate, settings: FinderSettings) -> bool:
+    return c.merit > settings.equal * best.merit and c.contrast > settings.faint * best.contrast
+
+
+def _predicted(search: _Search, near: tuple[float, float]) -> list[Candidate]:
     """The circle about a predicted centre, if one of about the expected radius is nearly complete there."""
-    factor = max(1, int(expected_radius / LARGEST))
+    settings = search.settings
+    factor = max(1, int(search.expected / LARGEST))
     found = []
     for bright in (False, True):
-        start = Candidate(u=near[0], v=near[1], radius=expected_radius, complete=0.0, visible=0.0, contrast=0.0,
+        start = Candidate(u=near[0], v=near[1], radius=search.expected, complete=0.0, visible=0.0, contrast=0.0,
                           bright=bright)  # fmt: skip
-        c = _checked(image, start, aspect, factor, SIZES - 1, ROUND)
-        c = c and _refined(image, c, aspect)
-        if c and c.complete > SURE and c.contrast > 0 and math.hypot(c.u - near[0], c.v - near[1]) < c.radius / 2:
+        c = _checked(search, start, factor, settings.size_ratio - 1, settings.round_coarse)
+        c = c and _refined(search, c)
+        close = c and math.hypot(c.u - near[0], c.v - near[1]) < c.radius / 2
+        if c and close and c.complete > settings.sure and c.contrast > 0:
             found.append(c)
-    return _distinct(found, expected_radius)
+    return _distinct(found, search)
 
 
-def _candidates(image: Array, expected_radius: float, aspect: float, smallest: float) -> list[Candidate]:
-    """Round shapes, best first: of about the expected radius, or else of any; BallNotFoundError without one."""
+def _candidates(search: _Search, *, every: bool = False) -> list[Candidate]:
+    """Round shapes, best first: of about the expected radius, or else of any; BallNotFoundError without one.
+
+    every: look at all levels that may show the expected radius, and refine all candidates.
+    """
     means: dict[int, Array] = {}
     coarse: list[Candidate] = []
-    fine: list[Candidate] = []
-    for group in _groups(_levels(image.shape, smallest), expected_radius):
+    settings = search.settings
+    for group in _groups(_levels(search.image.shape), search.expected, settings.size_ratio):
         for factor in group:
-            coarse += _on_level(_level(image, factor, means), factor, aspect)
-        coarse = _distinct(coarse, expected_radius)
-        if coarse and coarse[0].merit > CONVINCING:
-            fine = _finalists(image, coarse, aspect, expected_radius)
-            if fine and fine[0].merit > CONVINCING:
+            coarse += _on_level(_level(search.image, factor, means), factor, search)
+        coarse = _distinct(coarse, search)
+        if coarse and coarse[0].merit > settings.convincing and not every:
+            fine = _finalists(search, coarse, settings.finalists)
+            if fine and fine[0].merit > settings.convincing:
                 return fine
     if not coarse:
         raise BallNotFoundError(
             "no circle with a complete rim of one polarity; is the ball in view, and its contrast above noise?"
         )
-    fine = _finalists(image, coarse, aspect, expected_radius)
+    fine = _finalists(search, coarse, len(coarse) if every else settings.finalists)
     if not fine:
-        raise BallNotFoundError("nothing in the image is round enough to be a ball")
+        best = coarse[0]
+        raise BallNotFoundError(
+            f"nothing in the image is round enough to be a ball; the best shape, at ({best.u:.0f}, {best.v:.0f}) with "
+            f"a radius of about {best.radius:.0f} px, agrees with a circle on {100 * best.complete:.0f} % of its rim"
+        )
     return fine
 
 
-def _groups(levels: list[int], expected_radius: float) -> tuple[list[int], ...]:
+def _groups(levels: list[int], expected_radius: float, size_ratio: float) -> tuple[list[int], ...]:
     """The levels in the order of search: the one for the expected radius, others that show it too, all others."""
-    low, high = expected_radius / SIZES, expected_radius * SIZES
+    low, high = expected_radius / size_ratio, expected_radius * size_ratio
     central = [min((f for f in levels if BLUNT * LARGEST * f >= high), default=levels[-1])]
     near = [f for f in levels if SMALLEST * f < high and LARGEST * f > low and f not in central]
     return central, near, [f for f in levels if f not in central and f not in near]
 
 
-def _finalists(image: Array, candidates: list[Candidate], aspect: float, expected_radius: float) -> list[Candidate]:
+def _finalists(search: _Search, candidates: list[Candidate], number: int) -> list[Candidate]:
     """The best few candidates, looked at again on finer images."""
-    again = [_refined(image, c, aspect) for c in candidates[:FINALISTS]]
-    return _distinct([c for c in again if c is not None], expected_radius)
+    again = [_refined(search, c) for c in candidates[:number]]
+    return _distinct([c for c in again if c is not None], search)
 
 
-def _refined(image: Array, c: Candidate, aspect: float) -> Candidate | None:
-    """The candidate on a finer image of its surroundings, so that the fit starts within a pixel; None if not round."""
-    factor = max(1, int(c.radius / 40))
-    return _checked(image, c, aspect, factor, max(2.0 * factor / c.radius, 0.15), FINE_ROUND)
+def _refined(search: _Search, c: Candidate) -> Candidate | None:
+    """The candidate on a finer image of its surroundings, so that the fit starts within a pixel; None if not round.
+
+    A wide blur is reduced to `fine_blur`, and along each ray as many samples are compared as it is wide.
+    """
+    settings = search.settings
+    factor = max(1, int(c.radius / settings.fine_radius))
+    level, u, v = _around(search, c, factor, 0.15)
+    shift = (factor - 1) / 2
+    blur = factor * rim_blur(
+        level, (c.u - u - shift) / factor, (c.v - v - shift) / factor, c.radius / factor, search.aspect,
+        -1.0 if c.bright else 1.0,
+    )  # fmt: skip
+    blur = blur if blur > settings.resolved_blur * factor else 0.0
+    factor = max(factor, int(blur / settings.fine_blur))
+    wide = min(settings.fine_widths * blur, c.radius / 2) / factor
+    found = _checked(search, c, factor, max(2.0 * factor / c.radius, 0.15), settings.round_fine, round(wide / STEP))
+    return found and replace(found, blur=blur)
+
+
+def _around(search: _Search, c: Candidate, factor: int, width: float) -> tuple[Array, int, int]:
+    """The image about a candidate in blocks of `factor` pixels, and its first pixel (u, v)."""
+    reach = (1.35 + width) * c.radius + 8
+    u, v = max(int(c.u - reach), 0), max(int(c.v - reach / search.aspect), 0)
+    around = search.image[v : int(c.v + reach / search.aspect) + 1, u : int(c.u + reach) + 1]
+    return block_mean(np.ascontiguousarray(around, dtype=np.float32), factor), u, v
 
 
 def _checked(
-    image: Array, c: Candidate, aspect: float, factor: int, width: float, tightness: float
+    search: _Search, c: Candidate, factor: int, width: float, tightness: float, wide: int = WIDE
 ) -> Candidate | None:  # fmt: skip
     """The candidate where a check in blocks of `factor` pixels leads; None if its rim is no circle's.
 
-    width: share of the radius by which it may differ.
+    width: share of the radius by which it may differ; wide: samples of a ray that are compared, at least WIDE.
     """
-    reach = (1.35 + width) * c.radius + 8
-    u, v = max(int(c.u - reach), 0), max(int(c.v - reach / aspect), 0)
-    around = image[v : int(c.v + reach / aspect) + 1, u : int(c.u + reach) + 1]
-    level = block_mean(np.ascontiguousarray(around, dtype=np.float32), factor)
+    level, u, v = _around(search, c, factor, width)
     shift, radius = (factor - 1) / 2, c.radius / factor
     yes, x, y, radius, complete, visible, contrast = check_circle(
         level, (c.u - u - shift) / factor, (c.v - v - shift) / factor, radius * (1 - width), radius * (1 + width),
-        -1.0 if c.bright else 1.0, aspect, 0.0, tightness,
+        -1.0 if c.bright else 1.0, search.aspect, 0.0, tightness, max(wide, WIDE), tuple(search.settings.rays),
     )  # fmt: skip
-    if not yes or complete < COMPLETE:
+    if not yes or complete < search.settings.complete:
         return None
     return Candidate(u=x * factor + shift + u, v=y * factor + shift + v, radius=radius * factor, complete=complete,
                      visible=visible, contrast=contrast, bright=c.bright, merit=c.merit)  # fmt: skip
 
 
-def _levels(shape: tuple[int, ...], smallest: float) -> list[int]:
+def _levels(shape: tuple[int, ...]) -> list[int]:
     """Block factors, finest first: from the smallest radius to circles as large as the image."""
     out = []
-    factor = max(1, 2 ** int(math.log2(max(smallest / SMALLEST, 1.0))))
+    factor = 1
     while min(shape) / factor >= 12:
         out.append(factor)
         if LARGEST * factor > max(shape):
@@ -201,15 +252,16 @@ def _level(image: Array, factor: int, means: dict[int, Array]) -> Array:
     return means[factor]
 
 
-def _on_level(level: Array, factor: int, aspect: float) -> list[Candidate]:
+def _on_level(level: Array, factor: int, search: _Search) -> list[Candidate]:
     found = []
-    noise, centres = circle_centres(level)
+    settings, rays = search.settings, tuple(search.settings.rays)
+    noise, centres = circle_centres(level, settings.least_votes, settings.edge_noise, settings.edge_share)
     for u, v, band, polarity, _votes in centres.tolist():
         (low, high), sign = BANDS[int(band)], -1.0 if polarity == 1 else 1.0
         yes, x, y, radius, complete, visible, contrast = check_circle(
-            level, u, v, 0.75 * low, 1.3 * high, sign, aspect, noise, ROUND
+            level, u, v, 0.75 * low, 1.3 * high, sign, search.aspect, noise, settings.round_coarse, WIDE, rays
         )
-        if yes and complete >= COMPLETE and contrast > 0:
+        if yes and complete >= settings.complete and contrast > 0:
             shift = (factor - 1) / 2
             found.append(
                 Candidate(u=x * factor + shift, v=y * factor + shift, radius=radius * factor, complete=complete,
@@ -218,17 +270,17 @@ def _on_level(level: Array, factor: int, aspect: float) -> list[Candidate]:
     return found
 
 
-def _distinct(candidates: list[Candidate], expected_radius: float) -> list[Candidate]:
+def _distinct(candidates: list[Candidate], search: _Search) -> list[Candidate]:
     """Candidates with their merit, best first, one of each group that overlaps with a similar radius."""
     if not candidates:
         return []
     ranked = []
     strongest = max(c.contrast for c in candidates)
     for c in candidates:
-        off = max(abs(math.log(c.radius / expected_radius)) - 0.25, 0.0) / PRIOR
+        off = max(abs(math.log(c.radius / search.expected)) - 0.25, 0.0) / search.settings.size_prior
         merit = c.complete**2 * (0.4 + 0.6 * math.exp(-0.5 * off**2)) * math.sqrt(min(1.0, c.visible + 0.25))
         merit *= (c.contrast / strongest) ** 0.1
-        ranked.append(Candidate(**{**c.__dict__, "merit": merit}))
+        ranked.append(replace(c, merit=merit))
     ranked.sort(key=lambda c: (-c.merit, c.u, c.v, c.radius))
     kept: list[Candidate] = []
     for c in ranked:

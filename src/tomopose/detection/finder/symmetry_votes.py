@@ -7,12 +7,10 @@ import math
 import numpy as np
 from numba import njit
 
-from tomopose.detection.rim_fit.order_statistics import select
+from tomopose.detection.order_statistics import select
 
 MOST, PEAKS = 10, 3
 """Centres of a level that are looked at, those with most votes, and how many of them a band and polarity can give."""
-LEAST_VOTES = 0.3
-"""Share of a circle's rim that must point to its centre."""
 SMALLEST, LARGEST = 3.4, 14.5
 """Radii, in px of a level, that are looked for on it; levels follow by factors of 2."""
 BANDS = ((3.4, 5.6), (5.6, 9.0), (9.0, 14.5))
@@ -80,7 +78,7 @@ def _votes(image, square, threshold):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _peaks(votes, reach):  # type: ignore[no-untyped-def]
+def _peaks(votes, reach, least):  # type: ignore[no-untyped-def]
     """(n, 3): u, v, votes of the highest local maxima of votes summed over (2 reach + 1)^2 pixels."""
     rows, columns = votes.shape
     total = np.zeros((rows, columns), np.float32)
@@ -94,7 +92,7 @@ def _peaks(votes, reach):  # type: ignore[no-untyped-def]
     for j in range(rows):
         for i in range(columns):
             here = total[j, i]
-            if here >= LEAST_VOTES and here > out[PEAKS - 1, 2] and _is_highest(total, i, j):
+            if here >= least and here > out[PEAKS - 1, 2] and _is_highest(total, i, j):
                 _rank(out, np.array([i, j, here]))
     return out[: np.sum(out[:, 2] > 0.0)]
 
@@ -111,10 +109,11 @@ def _is_highest(total, i, j):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def circle_centres(level):  # type: ignore[no-untyped-def]
+def circle_centres(level, least_votes, edge_noise, edge_share):  # type: ignore[no-untyped-def]
     """(noise of a pixel, (n, 5)): u, v, band, polarity, votes of places that edges point to or away from, most first.
 
-    level: float32.  The polarity is 0 for an inside darker than its surroundings, 1 for a brighter one.
+    level: float32; the rest: of FinderSettings.  The polarity is 0 for an inside darker than its surroundings, 1
+    for a brighter one.
     """
     found = np.zeros((MOST, 5))
     if min(level.shape) < 9:
@@ -125,12 +124,12 @@ def circle_centres(level):  # type: ignore[no-untyped-def]
     sample = square[1:-1:3, 1:-1:3].copy().ravel()
     noise = select(sample, sample.shape[0] // 4) / 0.575 / 2
     top = np.max(square)
-    threshold = np.float32(max(36.0 * noise, 2e-5 * top))
+    threshold = np.float32(max(edge_noise**2 * noise, edge_share**2 * top))
     if top > threshold:
         votes = _votes(level, square, threshold)
         for polarity in range(2):
             for band in range(len(BANDS)):
-                for u, v, count in _peaks(votes[polarity, band], 1 if band == 0 else 2):
+                for u, v, count in _peaks(votes[polarity, band], 1 if band == 0 else 2, least_votes):
                     _rank(found, np.array([u, v, band, polarity, count]))
     return math.sqrt(noise), found[: np.sum(found[:, 4] > 0.0)]
 

@@ -3,61 +3,48 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 from scipy.ndimage import convolve
 
-from tomopose.detection.rim_fit.order_statistics import median, select
+from tomopose.detection.order_statistics import NORMAL_MEDIAN, median, select
+from tomopose.detection.rim_fit.state import Noise, RimFit
+from tomopose.detection.rim_model.ring import SHELLS
+from tomopose.detection.settings import NoiseSettings
+from tomopose.errors import BallNotFoundError
 from tomopose.units import Array
 
-REACH = 5
-"""Lag, px, at which noise no longer counts as correlated: a scintillator's or an interpolation's ends before."""
-SIGNIFICANT = 3.5
-"""Standard deviations by which a neighbour's correlation must differ from 0 before noise counts as correlated."""
-SMALLEST = 0.06
-"""Correlation of neighbours below which noise counts as white: a holder leaves some in the residuals too."""
-
-
-LEAK, ENOUGH = 3, 50
-"""Distance from the rim, px, within which noise is measured px by px, and the pixels that this takes."""
-CLIPPED = 0.25
-"""Share of the lower quartile below which a sector's variance is that of a saturated background."""
-NORMAL_MEDIAN = 0.455
-"""Median of the square of a standard normal variable."""
-KEPT, SHORT = 1.5, 0.139
-"""Standard deviations above their mean up to which sectors' variances count as noise alone, and what that cut takes
-from the mean: phi(1.5) / Phi(1.5)."""
-
-
-RARE = 0.1
-"""Prior share of sets of residuals that hold more than noise."""
+SHORT = 0.139
+"""What a cut 1.5 standard deviations above it takes from a normal mean: phi(1.5) / Phi(1.5)."""
 
 
 @njit(cache=True)
-def evident(square, freedom):  # type: ignore[no-untyped-def]
+def excess_variance(square, freedom, rare):  # type: ignore[no-untyped-def]
     """Mean square of so many residuals in standard deviations, brought down to 1 so far as chance may have raised it.
 
     What is above 1 counts by the probability that there is more than noise: the likelihood ratio at its maximum,
-    times the width that it has in `square`, against the prior odds.
+    times the width that it has in `square`, against the prior odds of `rare`.
     """
     if not square > 1.0:
         return 1.0
-    chance = (1.0 / RARE - 1.0) * math.sqrt(0.5 * freedom)
+    chance = (1.0 / rare - 1.0) * math.sqrt(0.5 * freedom)
     chance *= math.exp(-0.5 * freedom * (square - 1.0 - math.log(square)))
     return 1.0 + (square - 1.0) / (1.0 + chance)
 
 
 @njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
-def weights(s, residual, model, first, sigma, level, white, floor, parameters, outlier):  # type: ignore[no-untyped-def]
+def _weights(s, residual, model, first, stand, parameters, outlier, clipped, kept_below):  # type: ignore[no-untyped-def]
     """(weight (n,), variance inside, outside, excess (k,), spread): weights by a variance linear in the level.
 
-    s: signed distance; first: (k + 1,) of by_sector; floor: least variance; parameters: linear parameters that a
-    sector's pixels determine.  Pixels more than `outlier` standard deviations off get no weight.  The variance outside
-    is that of the sectors that are fitted well, NaN where none has enough pixels; excess: each sector's chi-square
-    outside less 1; spread: what noise alone lets it vary by.
+    s: signed distance; first: (k + 1,), where sectors begin; stand: blur, background level, ball's value, and least
+    variance; parameters: linear parameters that a sector's pixels determine.  Pixels more than `outlier` standard
+    deviations off get no weight.  The variance outside is that of the sectors that are fitted well, NaN where none has
+    enough pixels; excess: each sector's chi-square outside less 1; spread: what noise alone lets it vary by.
     """
+    sigma, level, white, floor = stand
     n, k = s.shape[0], first.shape[0] - 1
     square = residual * residual
     limit, part = np.zeros(k), np.empty(n)
@@ -108,7 +95,7 @@ def weights(s, residual, model, first, sigma, level, white, floor, parameters, o
     # What a sector's variance would be at the mean level of the background.
     for j in range(k):
         mean[j] /= min(max((v_in + (usual - v_in) * share[j]) / max(usual, 1e-300), 0.5), 2.0)
-    v_out, spread = _quiet(mean[enough], median(count[enough]))
+    v_out, spread = _quiet(mean[enough], median(count[enough]), clipped, kept_below)
     v_out = max(v_out, floor)
     weight, chi2 = np.empty(n), np.zeros(k)
     per_level = 1.0 / (level - level_in)
@@ -122,52 +109,85 @@ def weights(s, residual, model, first, sigma, level, white, floor, parameters, o
 
 
 @njit(cache=True)
-def _quiet(variance, n):  # type: ignore[no-untyped-def]
+def _quiet(variance, n, clipped, kept_below):  # type: ignore[no-untyped-def]
     """(mean, relative spread) of the sectors' variances that belong together at their low end.
 
     n: pixels of a sector.  A holder's edges add to a sector's variance; only a clipped background takes some away.
     """
     ordered = np.sort(variance)
-    ordered = ordered[ordered > CLIPPED * ordered[ordered.shape[0] // 4]]
+    ordered = ordered[ordered > clipped * ordered[ordered.shape[0] // 4]]
     m = ordered.shape[0]
     low, quarter = ordered[m // 10], ordered[m // 4]
     spread = max(math.sqrt(2.0 / n), min((quarter - low) / (0.607 * max(quarter, 1e-300)), 0.5))
     middle = quarter * (1.0 + 0.67 * spread)
     for _ in range(4):
-        kept = ordered[ordered < middle * (1.0 + KEPT * spread)]
+        kept = ordered[ordered < middle * (1.0 + kept_below * spread)]
         middle = np.mean(kept) * (1.0 + SHORT * spread)
     return middle, spread
 
 
-def correlation(u: Array, v: Array, normalised: Array) -> Array:
-    """Autocorrelation (2 REACH + 1, 2 REACH + 1) of normalised residuals at pixels u, v; a delta where it is white.
+def weighted(fit: RimFit, parameters: float) -> RimFit:
+    """Pixels weighted by the noise of the image; parameters: linear ones that a sector's pixels determine."""
+    p = fit.parameters
+    weight, v_in, v_out, excess, scatter = _weights(
+        fit.distance, fit.residual, fit.model, fit.pixels.bounds[::SHELLS],
+        (p.blur, p.level, float(p.white), fit.floor), parameters, fit.settings.fit.outlier,
+        fit.settings.noise.clipped, fit.settings.noise.kept,
+    )  # fmt: skip
+    if not math.isfinite(v_out):
+        raise BallNotFoundError(
+            f"too few usable pixels outside the rim to measure the noise: the blur of {p.blur:.1f} px, the image's "
+            f"border or bad pixels leave no sector with enough of them beyond {3 * p.blur:.1f} px"
+        )
+    return replace(fit, weight=weight, noise=Noise(v_in, v_out, excess, scatter, np.ones((1, 1)), apart=False))
 
-    A fit takes as much away from every lag (and from the variance) as residuals at a distance of REACH are
+
+def with_noise_correlation(fit: RimFit) -> RimFit:
+    """The noise's autocorrelation, where the background fits: what is left of an edge is correlated too.
+
+    On a ring too small to distinguish the two, what is left counts as noise.
+    """
+    outside = (fit.distance > 3 * fit.parameters.blur) & (fit.weight > 0)
+    quiet = outside & (fit.noise.excess < fit.noise.scatter)[fit.pixels.sector]
+    apart = bool(np.count_nonzero(quiet) > fit.settings.noise.enough_quiet)
+    used = np.flatnonzero(quiet if apart else outside)
+    rho = np.ones((1, 1))
+    if used.size > fit.settings.noise.fewest_pixels:
+        normalised = (fit.residual * np.sqrt(fit.weight))[used]
+        rho = correlation(fit.pixels.u[used], fit.pixels.v[used], normalised, fit.settings.noise)
+    return replace(fit, noise=fit.noise._replace(rho=rho, apart=apart))
+
+
+def correlation(u: Array, v: Array, normalised: Array, settings: NoiseSettings) -> Array:
+    """Autocorrelation (2 reach + 1, 2 reach + 1) of normalised residuals at pixels u, v; a delta where it is white.
+
+    A fit takes as much away from every lag (and from the variance) as residuals at a distance of `reach` are
     correlated, where the noise itself is not.
     """
-    rho = np.zeros((2 * REACH + 1, 2 * REACH + 1))
-    rho[REACH, REACH] = 1.0
-    grid = _grid(u, v, normalised)
-    near, count = _correlation(grid, 1)
+    reach = settings.reach
+    rho = np.zeros((2 * reach + 1, 2 * reach + 1))
+    rho[reach, reach] = 1.0
+    grid = _grid(u, v, normalised, reach)
+    near, count = _correlation(grid, 1, reach)
     neighbour = max(abs(near[1, 2]), abs(near[2, 1]))
-    if not neighbour > max(SIGNIFICANT / math.sqrt(max(count[1, 2], 1.0)), SMALLEST):
+    if not neighbour > max(settings.significant / math.sqrt(max(count[1, 2], 1.0)), settings.smallest):
         return rho
-    rho, count = _correlation(grid, REACH)
+    rho, count = _correlation(grid, reach, reach)
     rim = np.ones(rho.shape, dtype=bool)
     rim[1:-1, 1:-1] = False
     rho += max(-float(np.average(rho[rim], weights=count[rim])), 0.0)
-    lag = np.abs(np.arange(-REACH, REACH + 1))
+    lag = np.abs(np.arange(-reach, reach + 1))
     ring = np.maximum(lag[:, None], lag)
     # They end where a ring of lags is 0; of its 8 r lags half repeat the others, and neighbours vary together.
-    chance = float(near.sum()) / math.sqrt(count[REACH, REACH])
-    over = next(r for r in range(3, REACH + 1) if r == REACH or rho[ring == r].mean() < 2.0 * chance / math.sqrt(4 * r))
+    chance = float(near.sum()) / math.sqrt(count[reach, reach])
+    over = next(r for r in range(3, reach + 1) if r == reach or rho[ring == r].mean() < 2.0 * chance / math.sqrt(4 * r))
     rho[ring >= over] = 0.0
     return rho
 
 
-def _correlation(grid: Array, reach: int) -> tuple[Array, Array]:
+def _correlation(grid: Array, reach: int, margin: int) -> tuple[Array, Array]:
     """Autocorrelation and the number of pairs, both (2 reach + 1, 2 reach + 1)."""
-    total, count = _lags(grid, reach)
+    total, count = _lags(grid, reach, margin)
     count = np.maximum(count, 1.0)
     return (total / count) / (total[reach, reach] / count[reach, reach]), count
 
@@ -175,9 +195,9 @@ def _correlation(grid: Array, reach: int) -> tuple[Array, Array]:
 def sandwich(u: Array, v: Array, influence: Array, rho: Array) -> Array:
     """Covariance (m, m) of estimates with influence (n, m), in units of a pixel's own noise, under correlation rho.
 
-    In no direction smaller than under white noise: a rho cut off at REACH need not be positive definite.
+    In no direction smaller than under white noise: a rho that is cut off need not be positive definite.
     """
-    grids = [_grid(u, v, influence[:, k], fill=0.0) for k in range(influence.shape[1])]
+    grids = [_grid(u, v, influence[:, k], len(rho) // 2, fill=0.0) for k in range(influence.shape[1])]
     spread = [convolve(grid, rho, mode="constant") for grid in grids]
     out = np.array([[float((a * b).sum()) for b in grids] for a in spread])
     root = np.linalg.cholesky(influence.T @ influence)
@@ -187,32 +207,36 @@ def sandwich(u: Array, v: Array, influence: Array, rho: Array) -> Array:
     return np.asarray((axes * np.maximum(values, 1.0)) @ axes.T)
 
 
-def across(s: Array, normalised: Array, clean: npt.NDArray[np.bool_]) -> Array:
+def noise_by_distance(
+    s: Array, normalised: Array, clean: npt.NDArray[np.bool_], settings: NoiseSettings
+) -> Array:  # fmt: skip
     """(n,) standard deviation of the noise in what was taken for it, by the distance s from the rim.
 
-    Light that spreads in a scintillator carries the background's noise over the rim, where the level tells of none.
+    Light that spreads in a scintillator carries the background's noise over the rim, where the level does not show it.
     """
-    bins = np.clip(np.floor(s), -LEAK - 1, LEAK).astype(np.int64) + LEAK + 1
-    square = np.bincount(bins[clean], normalised[clean] ** 2, 2 * LEAK + 2)
-    count = np.bincount(bins[clean], minlength=2 * LEAK + 2)
-    return np.asarray(np.sqrt(np.where(count > ENOUGH, square / np.maximum(count, 1), 1.0))[bins])
+    leak = settings.leak
+    bins = np.clip(np.floor(s), -leak - 1, leak).astype(np.int64) + leak + 1
+    square = np.bincount(bins[clean], normalised[clean] ** 2, 2 * leak + 2)
+    count = np.bincount(bins[clean], minlength=2 * leak + 2)
+    enough = count > settings.leak_pixels
+    return np.asarray(np.sqrt(np.where(enough, square / np.maximum(count, 1), 1.0))[bins])
 
 
-def _grid(u: Array, v: Array, values: Array, fill: float = np.nan) -> Array:
-    """Values on the pixel grid, with an empty margin of REACH."""
+def _grid(u: Array, v: Array, values: Array, margin: int, fill: float = np.nan) -> Array:
+    """Values on the pixel grid, with an empty margin."""
     i, j = u.astype(np.int64), v.astype(np.int64)
-    grid = np.full((np.ptp(j) + 1 + 2 * REACH, np.ptp(i) + 1 + 2 * REACH), fill)
-    grid[j - j.min() + REACH, i - i.min() + REACH] = values
+    grid = np.full((np.ptp(j) + 1 + 2 * margin, np.ptp(i) + 1 + 2 * margin), fill)
+    grid[j - j.min() + margin, i - i.min() + margin] = values
     return grid
 
 
 @njit(cache=True)
-def _lags(grid, reach):  # type: ignore[no-untyped-def]
+def _lags(grid, reach, margin):  # type: ignore[no-untyped-def]
     """(sum of products, number of pairs), both (2 reach + 1, 2 reach + 1), of values that lie so many px apart."""
     size = 2 * reach + 1
     total, count = np.zeros((size, size)), np.zeros((size, size))
-    for j in range(reach, grid.shape[0] - reach):
-        for i in range(reach, grid.shape[1] - reach):
+    for j in range(margin, grid.shape[0] - margin):
+        for i in range(margin, grid.shape[1] - margin):
             here = grid[j, i]
             if np.isnan(here):
                 continue

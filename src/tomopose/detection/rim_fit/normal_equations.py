@@ -6,22 +6,78 @@ A sector's pixels see the shape, w and the two nodes at its sides: 14 parameters
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from tomopose.detection.rim_fit.model import FIRST_NODE, KAPPA, SHELLS, WHITE
+from tomopose.detection.rim_fit.state import Indices, RimFit, Unknowns, active_parameters, jacobian_rows
+from tomopose.detection.rim_model.ring import SHELLS
+from tomopose.detection.rim_model.rows import FIRST_NODE, KAPPA, LOCAL, WHITE
+from tomopose.units import Array
 
-LOCAL = FIRST_NODE + 6
-"""Parameters of a sector, in the order of the Jacobian's rows."""
+
+class Equations(NamedTuple):
+    """blocks (k, 15, 14): each sector's part; N (p, p), upper triangle, and g (p,): their sum, without priors."""
+
+    blocks: Array
+    N: Array
+    g: Array
+
+
+def equations(fit: RimFit, unknowns: Unknowns) -> Equations:
+    """Of all shells that have weight."""
+    blocks = shell_blocks(fit, unknowns, 0, 1)
+    if fit.shells > 1 and fit.pixels.bounds[-1] > 0:
+        blocks = blocks + shell_blocks(fit, unknowns, 1, fit.shells)
+    return summed(blocks)
+
+
+def summed(blocks: Array, share: Array | None = None) -> Equations:
+    """The equations of the sectors' blocks, each times its share."""
+    N, g = _assembled(blocks, np.ones(len(blocks)) if share is None else share)
+    return Equations(blocks, N, g)
+
+
+def shell_blocks(fit: RimFit, unknowns: Unknowns, low: int, high: int) -> Array:
+    """Each sector's part (k, 15, 14) of the shells from low to before high."""
+    edge = low == 0 or fit.edge_shells > 1
+    return np.asarray(
+        _sector_blocks(
+            fit.pixels.value, fit.model, fit.jacobian, fit.pixels.bounds, fit.weight,
+            jacobian_rows(unknowns, edge=edge), low, high,
+        )
+    )  # fmt: skip
+
+
+def with_gradient(fit: RimFit, unknowns: Unknowns, known: Equations) -> Equations:
+    """The same matrix with the right side of the present residuals."""
+    rows = jacobian_rows(unknowns, edge=True)
+    g = _gradient(fit.pixels.value, fit.model, fit.jacobian, fit.pixels.bounds, fit.weight, rows, fit.shells)
+    return known._replace(g=g)
+
+
+def with_priors(fit: RimFit, of: Equations, unknowns: Unknowns) -> tuple[Array, Array]:
+    """Rows and columns of N and g of what is fitted, priors added."""
+    p, priors = fit.parameters, fit.priors
+    N, g = _with_priors(
+        of.N, of.g, active_parameters(unknowns, len(p.nodes)), p.shape, float(p.white), p.nodes, priors.kappa,
+        priors.log_radius, priors.white, priors.nodes,
+    )  # fmt: skip
+    return N, g
+
+
+def place_of(unknowns: Unknowns, nodes: int, index: Indices) -> Indices:
+    """Where the parameters with those indices stand among those that are fitted."""
+    return np.searchsorted(active_parameters(unknowns, nodes), index)
 
 
 @njit(cache=True, fastmath=True)
-def sector_blocks(image, value, jacobian, first, weight, columns, low, high):  # type: ignore[no-untyped-def]
+def _sector_blocks(image, value, jacobian, first, weight, columns, low, high):  # type: ignore[no-untyped-def]
     """(k, LOCAL + 1, LOCAL): each sector's part of N, lower triangle, and in the last row of g; shells low to high.
 
-    first: (k SHELLS + 1,) of by_sector.  columns: rows of the Jacobian that count (the others are left 0).  Within a
-    sector every entry is one sum along the pixels, which runs in registers.
+    first: (k SHELLS + 1,), RingPixels.bounds.  columns: rows of the Jacobian that count (the others are left 0).
+    Within a sector every entry is one sum along the pixels, which runs in registers.
     """
     k = (first.shape[0] - 1) // SHELLS
     out = np.zeros((k, LOCAL + 1, LOCAL))
@@ -52,7 +108,7 @@ def sector_blocks(image, value, jacobian, first, weight, columns, low, high):  #
 
 
 @njit(cache=True)
-def assembled(blocks, share):  # type: ignore[no-untyped-def]
+def _assembled(blocks, share):  # type: ignore[no-untyped-def]
     """(N (8 + 3k, 8 + 3k), upper triangle, g): the sum of the sectors' blocks, each times its `share` (k,)."""
     k = blocks.shape[0]
     size = FIRST_NODE + 3 * k
@@ -69,7 +125,7 @@ def assembled(blocks, share):  # type: ignore[no-untyped-def]
     return N, g
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _place(p, node, k):  # type: ignore[no-untyped-def]
     """Where parameter p of a sector's Jacobian stands among all parameters."""
     if p < FIRST_NODE:
@@ -80,8 +136,8 @@ def _place(p, node, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True)
-def gradient(image, value, jacobian, first, weight, columns, high):  # type: ignore[no-untyped-def]
-    """g alone of normal_equations, of the shells before `high`."""
+def _gradient(image, value, jacobian, first, weight, columns, high):  # type: ignore[no-untyped-def]
+    """g alone, of the shells before `high`."""
     k = (first.shape[0] - 1) // SHELLS
     g = np.zeros(FIRST_NODE + 3 * k)
     residual = weight * (image - value)
@@ -98,23 +154,21 @@ def gradient(image, value, jacobian, first, weight, columns, high):  # type: ign
 
 
 @njit(cache=True)
-def with_priors(N, g, active, shape, white, nodes, kappa_start, white_prior, node_precision):  # type: ignore[no-untyped-def]
-    """Rows and columns `active` of N (upper triangle) and g, priors added.
-
-    kappa_start: mean and standard deviation of kappa's prior.  white_prior: mean and precision of w's.  node_precision:
-    (3k,) of a, about the mean level, and of b and c, about 0.
-    """
+def _with_priors(N, g, active, shape, white, nodes, kappa, log_radius, white_prior, precisions):  # type: ignore[no-untyped-def]
+    """Rows and columns `active` of N (upper triangle) and g, with the fields of Priors added."""
     precision, pull = np.zeros(g.shape[0]), np.zeros(g.shape[0])
     if math.isfinite(shape[KAPPA]):
-        precision[KAPPA] = 1.0 / kappa_start**2
-        pull[KAPPA] = precision[KAPPA] * (kappa_start - shape[KAPPA])
+        precision[KAPPA] = 1.0 / kappa**2
+        pull[KAPPA] = precision[KAPPA] * (kappa - shape[KAPPA])
+    precision[2] = log_radius[1] / shape[2] ** 2
+    pull[2] = precision[2] * shape[2] * (log_radius[0] - math.log(shape[2]))
     precision[WHITE] = white_prior[1]
     pull[WHITE] = white_prior[1] * (white_prior[0] - white)
     level = np.mean(nodes[:, 0])
     for j in range(nodes.shape[0]):
         for c in range(3):
             i = FIRST_NODE + 3 * j + c
-            precision[i] = node_precision[3 * j + c]
+            precision[i] = precisions[3 * j + c]
             pull[i] = precision[i] * ((level if c == 0 else 0.0) - nodes[j, c])
     n = active.shape[0]
     part, right = np.zeros((n, n)), np.empty(n)

@@ -7,20 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from tomopose.detection.settings import RunSettings
 from tomopose.errors import InputError, ShapeError
 
 Row = dict[str, Any]
 
 NO_FORM: tuple[list[int], str] = ([], "")
 """Shape and type of an image that could not be opened."""
-RUN = 5
-"""From this many measured images on, one is compared with the others."""
-OTHER_SIZE = 1.5
-"""Ratio to the run's median radius from which a shape is not the ball: magnification does not vary that much."""
-MOST_UNUSABLE = 0.05
-"""Share of images that cannot be read or are none, above which a run stops; one in a short run is let through."""
-OFF, FAR_OFF = 0.02, 0.2
-"""Relative distance of the nominal radius from all that the run shows, from which it is flagged, or wrong."""
 
 
 def refuse_another_form(first: Row, row: Row) -> None:
@@ -35,10 +28,10 @@ def refuse_another_form(first: Row, row: Row) -> None:
         )
 
 
-def refuse_unusable(rows: list[Row]) -> None:
+def refuse_unusable(rows: list[Row], settings: RunSettings) -> None:
     """Raises where too many images could not even be looked at: that is the caller's input, not one bad image."""
     bad = [row for row in rows if str(row.get("reason", "")).startswith("bad image")]
-    if not bad or (len(bad) < len(rows) and len(bad) <= max(1, MOST_UNUSABLE * len(rows))):
+    if not bad or (len(bad) < len(rows) and len(bad) <= max(1, settings.most_unusable * len(rows))):
         return
     error = ShapeError if bad[0]["fault"] == "ShapeError" else InputError
     number = f"all {len(rows)}" if len(bad) == len(rows) else f"{len(bad)} of {len(rows)}"
@@ -47,17 +40,17 @@ def refuse_unusable(rows: list[Row]) -> None:
     )
 
 
-def of_one_size(rows: list[Row]) -> list[Row]:
+def of_one_size(rows: list[Row], settings: RunSettings) -> list[Row]:
     """The rows, with a refusal in place of one that shows something of quite another size than the other images."""
     radii = [row["radius"] for row in rows if "x_D" in row]
-    if len(radii) < RUN:
+    if len(radii) < settings.enough:
         return rows
     usual = float(np.median(radii))
-    return [_of_size(row, usual) for row in rows]
+    return [_of_size(row, usual, settings) for row in rows]
 
 
-def _of_size(row: Row, usual: float) -> Row:
-    if "x_D" not in row or abs(math.log(row["radius"] / usual)) < math.log(OTHER_SIZE):
+def _of_size(row: Row, usual: float, settings: RunSettings) -> Row:
+    if "x_D" not in row or abs(math.log(row["radius"] / usual)) < math.log(settings.other_size):
         return row
     u, v = row["x_D"]
     return {
@@ -67,20 +60,20 @@ def _of_size(row: Row, usual: float) -> Row:
     }
 
 
-def nominal_radius_is_off(rows: list[Row], expected: float, ball_diameter: float) -> bool:
+def nominal_radius_is_off(rows: list[Row], expected: float, ball_diameter: float, settings: RunSettings) -> bool:
     """Whether a ball on the rotation axis would be larger or smaller than in every image, by more than 2 %.
 
     expected: its radius there, px.  A run's poses move the ball along the beam, so that its radii differ; where they
     do not reach the nominal one by 20 %, d_SD, d_SR, a pitch or the diameter is wrong: InputError.
     """
     ratio = [row["radius"] / expected for row in rows if "x_D" in row]
-    if len(ratio) < RUN:
+    if len(ratio) < settings.enough:
         return False
     off = max(min(ratio) - 1.0, 1.0 - max(ratio))
-    if off > FAR_OFF:
+    if off > settings.far_off:
         raise InputError(
             f"the ball's silhouettes have {100 * min(ratio):.0f} to {100 * max(ratio):.0f} % of the size that "
             f"ball_diameter = {ball_diameter:g} mm has on the rotation axis; d_SD, d_SR, a pixel pitch or the diameter "
             "is wrong"
         )
-    return off > OFF
+    return off > settings.off

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from tomopose.detection.flags import MOTION, expected_radius, motion_length
-from tomopose.detection.image import detect_image, region_about
-from tomopose.detection.result import BallImage
+from tomopose.detection.flags import expected_radius, motion_length
+from tomopose.detection.image import checked_diameter, require_types
+from tomopose.detection.reading import Image, region_about
 from tomopose.detection.run.checks import (
-    NO_FORM,
-    RUN,
     Row,
     nominal_radius_is_off,
     of_one_size,
@@ -23,51 +21,31 @@ from tomopose.detection.run.checks import (
     refuse_unusable,
 )
 from tomopose.detection.run.executors import ordered_map
-from tomopose.detection.run.input_faults import fault_of_input
-from tomopose.detection.run.journal import append, fingerprint, read_journal
-from tomopose.detection.run.lag import ghost_share
-from tomopose.errors import (
-    AmbiguousBallError,
-    BallNotFoundError,
-    BallTruncatedError,
-    DetectionError,
-    InputError,
-    TomoposeError,
-)
+from tomopose.detection.run.journal import append, open_journal
+from tomopose.detection.run.lag import Lag, usual_lag
+from tomopose.detection.run.rows import Before, LazyImage, Task, Work, column, row_of, with_lag
+from tomopose.detection.settings import DEFAULT, DetectionSettings
+from tomopose.errors import InputError
 from tomopose.geometry.scanner import Scanner
+from tomopose.kept import key_of
 from tomopose.observations import BallObservations
 from tomopose.units import Array
-
-
-class _Lazy:
-    """One image of a lazy sequence: read in the process that measures it, and only where needed."""
-
-    def __init__(self, images: Any, index: int) -> None:
-        self.images, self.index = images, index
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        shape = getattr(self.images, "shape", None)
-        if shape is not None:
-            return tuple(shape)[-2:]
-        return tuple(np.shape(self.images[self.index]))
-
-    def region(self, v0: int, v1: int, u0: int, u1: int) -> Array:
-        return np.asarray(self.images.region(self.index, v0, v1, u0, u1))
 
 
 def detect(
     images: Iterable[Any],
     scanner: Scanner,
     *,
-    ball_diameter: float = 8.0,
+    ball_diameter: float | Mapping[int, float],
+    ball_id: Sequence[int] | npt.NDArray[np.int64] | None = None,
     pose_id: Iterable[Any] | None = None,
-    predicted: Any = None,
-    origin: tuple[int, int] = (0, 0),
+    predicted: npt.ArrayLike | None = None,
+    origin: tuple[int, int] | Sequence[tuple[int, int]] = (0, 0),
     workers: int = 1,
     executor: Any = None,
     progress: Callable[[int, int], None] | None = None,
     journal: str | Path | None = None,
+    settings: DetectionSettings = DEFAULT,
 ) -> BallObservations:
     """Where the ball's centre is projected in each radiograph, with its covariance.
 
@@ -78,7 +56,9 @@ def detect(
                     v1)` that asks the system for rows beforehand), which is read in the worker processes.  One image
                     is handled at a time.
     scanner:        intrinsic geometry.
-    ball_diameter:  nominal, mm.
+    ball_diameter:  nominal, mm; or, where each image shows several balls, ball id -> mm of all of them.
+    ball_id:        (n,) which ball each row is for, with several balls: an image that shows two of them comes twice.
+                    They are identified by `predicted`, or by their size where diameters differ by 20 %.
     pose_id:        names of the rows; without it, the images' indices.
     predicted:      (n, 2) px in D where the ball should be (NaN: not known): only that region is read and searched.
     origin:         D coordinates (u, v) of pixel [0, 0], for cropped images; or (n, 2), one for each image.
@@ -86,6 +66,7 @@ def detect(
     executor:       a concurrent.futures executor or a dask.distributed client to use instead.
     progress:       called with (done, total); total is 0 where the number of images is not known beforehand.
     journal:        file to which each finished image is added; images found in it unchanged are not measured again.
+    settings:       thresholds, each with its origin.
 
     Returns
     -------
@@ -99,54 +80,112 @@ def detect(
                 image and more than 5 % of them, or all, are unusable (unreadable, of the wrong size, bytes or pitches
                 exchanged); where the ball has 20 % more or less than its nominal size in every image.
     """
-    lazy = hasattr(images, "region") and hasattr(images, "__len__")
-    total = len(images) if hasattr(images, "__len__") else 0  # type: ignore[arg-type]
+    require_types(scanner, settings)
+    total = len(images) if isinstance(images, Sized) else 0
     names = getattr(images, "names", None)
     names = None if names is None else tuple(str(n) for n in names)
     ids = None if pose_id is None else tuple(str(i) for i in pose_id)
     where = None if predicted is None else np.asarray(predicted, dtype=np.float64).reshape(-1, 2)
-    for name, column in (("pose ids", ids), ("predicted positions", where), ("image names", names)):
-        if total and column is not None and len(column) != total:
-            raise InputError(f"{total} images but {len(column)} {name}; one for each image is needed")
-    settings = f"{scanner!r} {ball_diameter!r}"
+    columns = {"pose ids": ids, "predicted positions": where, "image names": names, "ball ids": ball_id}
+    for name, given in columns.items():
+        if total and given is not None and len(given) != total:
+            raise InputError(f"{total} images but {len(given)} {name}; one for each image is needed")
+    diameters = _Diameters(ball_diameter, ball_id)
+    work = Work(scanner=scanner, mask=getattr(images, "mask", None), settings=settings, keyed=journal is not None)
     path = None if journal is None else Path(journal)
-    done = read_journal(path)
-    work = partial(_row, scanner=scanner, ball_diameter=ball_diameter, mask=getattr(images, "mask", None),
-                   settings=settings, keyed=path is not None)  # fmt: skip
+    done: dict[str, Row] = {}
+    if path is not None:
+        key = key_of("detection-journal", scanner=scanner, balls=diameters.words, mask=work.mask, settings=settings)
+        done = open_journal(path, key)
 
-    def fetch(i: int) -> None:
-        """Lets image i come from the disk while the one before is measured, where the images can be asked to."""
-        if not (lazy and hasattr(images, "fetch") and i < total):
-            return
-        rows, columns = _Lazy(images, i).shape
-        v0, v1 = 0, rows
-        if where is not None and np.isfinite(where[i]).all():
-            expected = expected_radius(scanner, ball_diameter)
-            v0, v1, *_ = region_about(where[i] - _origin_of(origin, i), (rows, columns), scanner, expected)
-        if v0 < v1:
-            images.fetch(i, v0, v1)
+    def task_of(i: int) -> Task:
+        at = None if where is None or i >= len(where) else (float(where[i, 0]), float(where[i, 1]))
+        own, others = diameters.at(i)
+        name = names[i] if names is not None else str(i)
+        if ball_id is not None:
+            name = f"{name} ball {ball_id[i]}"
+        return Task(name=name, ball_diameter=own, other_diameters=others, predicted=at, origin=_origin_of(origin, i))
 
-    def tasks() -> Iterator[tuple[Any, ...]]:
-        source = (_Lazy(images, i) for i in range(total)) if lazy else images
+    def tasks() -> Iterator[tuple[Image, Task, Row | None]]:
+        lazy = hasattr(images, "region") and hasattr(images, "__len__")
+        source = (LazyImage(images, i) for i in range(total)) if lazy else images
         for i, image in enumerate(source):
-            fetch(i + 1)
-            name = names[i] if names is not None else str(i)
-            at = None if where is None else (where[i] if i < len(where) else None)
-            yield image, name, None if at is None else tuple(at), _origin_of(origin, i), done.get(name)
+            if lazy and hasattr(images, "fetch") and i + 1 < total:
+                _fetch(images, i + 1, task_of(i + 1), scanner)
+            task = task_of(i)
+            yield image, task, done.get(task.name)
 
     rows: list[Row] = []
-    for task, row in ordered_map(work, tasks(), workers=workers, executor=executor):
-        if path is not None and row is not done.get(row["name"]) and row != done.get(row["name"]):
+    before: dict[float, Before] = {}
+    lags: list[Lag] = []
+    for (image, task, _), row in ordered_map(partial(row_of, work=work), tasks(), workers=workers, executor=executor):
+        if path is not None and row != done.get(row["name"]):
             append(path, row)
         if rows and np.ndim(origin) == 1:
             refuse_another_form(rows[0], row)
-        rows.append({**row, "lag": _lag(task[0], task[3], scanner, row, rows[-1] if rows else None)})
+        held = np.asarray(image) if not isinstance(image, LazyImage) and "x_D" in row else image
+        row, lag = with_lag(row, held, before.get(task.ball_diameter), task, work=work)
+        rows.append(row)
+        lags += [lag] if lag.share > 0 else []
+        before[task.ball_diameter] = Before(row, held if "x_D" in row else NOTHING, usual_lag(lags))
         if progress is not None:
             progress(len(rows), total)
-    refuse_unusable(rows)
-    rows = of_one_size(rows)
-    off = nominal_radius_is_off(rows, expected_radius(scanner, ball_diameter), ball_diameter)
-    return _observations(rows, ids, names, off)
+    refuse_unusable(rows, settings.run)
+    return _observations(diameters.judged(rows, scanner, settings), ids, names, settings)
+
+
+NOTHING = np.zeros((0, 0))
+"""In place of an image in which no ball was measured, so that it is freed."""
+
+
+class _Diameters:
+    """The nominal diameters of each row's ball, and of the others in its image."""
+
+    def __init__(
+        self, given: float | Mapping[int, float], ball_id: Sequence[int] | npt.NDArray[np.int64] | None
+    ) -> None:  # fmt: skip
+        if isinstance(given, Mapping):
+            self.by_ball = {int(b): checked_diameter(d) for b, d in given.items()}
+            if ball_id is None and len(self.by_ball) != 1:
+                raise InputError(f"{len(self.by_ball)} diameters but no ball_id; say which ball each row is for")
+            unknown = sorted({int(b) for b in (() if ball_id is None else ball_id)} - set(self.by_ball))
+            if unknown:
+                raise InputError(f"ball {unknown[0]} has no diameter; given are those of {sorted(self.by_ball)}")
+        else:
+            self.by_ball = {0: checked_diameter(given)}
+            ball_id = None
+        self.ball_id = ball_id
+
+    @property
+    def words(self) -> str:
+        return repr((sorted(self.by_ball.items()), None if self.ball_id is None else [int(b) for b in self.ball_id]))
+
+    def at(self, i: int) -> tuple[float, tuple[float, ...]]:
+        ball = next(iter(self.by_ball)) if self.ball_id is None else int(self.ball_id[i])
+        return self.by_ball[ball], tuple(d for b, d in self.by_ball.items() if b != ball)
+
+    def judged(self, rows: list[Row], scanner: Scanner, settings: DetectionSettings) -> list[Row]:
+        """The rows after the rules that need all rows of one ball: sizes that agree, and with the nominal one."""
+        out = list(rows)
+        for ball, diameter in self.by_ball.items():
+            at = [i for i in range(len(rows)) if self.ball_id is None or int(self.ball_id[i]) == ball]
+            own = of_one_size([rows[i] for i in at], settings.run)
+            off = nominal_radius_is_off(own, expected_radius(scanner, diameter), diameter, settings.run)
+            for i, row in zip(at, own, strict=True):
+                out[i] = {**row, "off": off}
+        return out
+
+
+def _fetch(images: Any, i: int, task: Task, scanner: Scanner) -> None:
+    """Lets image i come from the disk while the one before is measured."""
+    rows, columns = LazyImage(images, i).shape
+    v0, v1 = 0, rows
+    if task.predicted is not None and np.isfinite(task.predicted).all():
+        expected = expected_radius(scanner, task.ball_diameter)
+        at = np.asarray(task.predicted) - task.origin
+        v0, v1, *_ = region_about(at, (rows, columns), scanner, expected)
+    if v0 < v1:
+        images.fetch(i, v0, v1)
 
 
 def _origin_of(origin: Any, index: int) -> tuple[int, int]:
@@ -154,122 +193,39 @@ def _origin_of(origin: Any, index: int) -> tuple[int, int]:
     return pair[0], pair[1]
 
 
-def _row(
-    image: Any, name: str, predicted: tuple[float, float] | None, origin: tuple[int, int], done: Row | None, *,
-    scanner: Scanner, ball_diameter: float, mask: Any, settings: str, keyed: bool,
-) -> Row:  # fmt: skip
-    """One image's row as plain numbers, for journal and process borders."""
-    row: Row = {"name": name, "key": "", "form": list(NO_FORM)}
-    options = {"ball_diameter": ball_diameter, "predicted": predicted, "origin": origin, "mask": mask}
-    try:
-        if not isinstance(image, _Lazy):
-            image = np.asarray(image)
-        row["form"] = [list(image.shape), getattr(getattr(image, "dtype", None), "name", "")]
-        if keyed:
-            row["key"] = fingerprint(image, f"{settings} {predicted} {origin}") if len(image.shape) == 2 else ""
-            if done is not None and row["key"] and done.get("key") == row["key"]:
-                return done
-        try:
-            return row | _numbers(detect_image(image, scanner, **options))
-        except DetectionError as error:
-            # no name here for what is found: it would hold this frame, and with it the image, until the next collection
-            return _refused(row, fault_of_input(image, scanner, **options) or error)
-    except (TomoposeError, OSError, ValueError, EOFError) as error:
-        return _refused(row, error)
-
-
-def _refused(row: Row, error: Exception) -> Row:
-    return row | {"reason": _reason(error), "fault": type(error).__name__}
-
-
-def _numbers(ball: BallImage) -> Row:
-    return {
-        "x_D": ball.x_D.tolist(),
-        "covariance": ball.covariance.tolist(),
-        "snr": ball.snr,
-        "semi_major": ball.semi_major,
-        "semi_minor": ball.semi_minor,
-        "angle": ball.angle,
-        "x_ellipse": ball.x_ellipse.tolist(),
-        "radius": ball.radius,
-        "contrast": ball.level - ball.white,
-        "anisotropy": ball.anisotropy.tolist(),
-        "anisotropy_covariance": ball.anisotropy_covariance.tolist(),
-        "flags": list(ball.flags),
-    }
-
-
-def _reason(error: Exception) -> str:
-    """Short word first, then the sentence."""
-    message = str(error)
-    if isinstance(error, BallNotFoundError):
-        return f"not found: {message}"
-    if isinstance(error, BallTruncatedError):
-        return f"truncated: {message}"
-    if isinstance(error, AmbiguousBallError):
-        return f"ambiguous: {message}"
-    if isinstance(error, DetectionError):
-        return message
-    return f"bad image: {message}"
-
-
-def _lag(image: Any, origin: tuple[int, int], scanner: Scanner, row: Row, previous: Row | None) -> float:
-    """Share of the contrast that the previous ball left in this image."""
-    if previous is None or "x_D" not in row or "x_D" not in previous:
-        return 0.0
-    before, aspect = np.asarray(previous["x_D"]), scanner.p_v / scanner.p_u
-    radius = row["radius"] * math.sqrt(aspect)
-    before_radius = previous["radius"] * math.sqrt(aspect)
-    shape = tuple(image.shape)
-    u, v, reach = before[0] - origin[0], before[1] - origin[1], before_radius + 7.0
-    u0, v0 = max(int(u - reach), 0), max(int(v - reach / aspect), 0)
-    u1, v1 = min(int(u + reach) + 2, shape[1]), min(int(v + reach / aspect) + 2, shape[0])
-    if u1 - u0 < 8 or v1 - v0 < 8:
-        return 0.0
-    part = image.region(v0, v1, u0, u1) if isinstance(image, _Lazy) else np.asarray(image)[v0:v1, u0:u1]
-    return ghost_share(
-        np.asarray(part, dtype=np.float64), (u0 + int(origin[0]), v0 + int(origin[1])), np.asarray(row["x_D"]), radius,
-        before, before_radius, row["contrast"], aspect,
-    )  # fmt: skip
-
-
 def _observations(
-    rows: list[Row], ids: tuple[str, ...] | None, names: tuple[str, ...] | None, off: bool
+    rows: list[Row], ids: tuple[str, ...] | None, names: tuple[str, ...] | None, settings: DetectionSettings
 ) -> BallObservations:
     n = len(rows)
     if ids is not None and len(ids) != n:
         raise InputError(f"{n} images but {len(ids)} pose ids; one for each image is needed")
     seen = np.array(["x_D" in row for row in rows], dtype=bool)
     usual = np.zeros(2)
-    if seen.sum() >= RUN:
+    if seen.sum() >= settings.run.enough:
         usual = np.median([row["anisotropy"] for row in rows if "x_D" in row], axis=0)
-
-    def column(name: str, *shape: int) -> Array:
-        missing = np.full(shape, np.nan)
-        return np.array([row.get(name, missing) for row in rows], dtype=np.float64).reshape(n, *shape)
-
     return BallObservations(
-        x_D=column("x_D", 2),
-        covariance=column("covariance", 2, 2),
+        x_D=column(rows, "x_D", 2),
+        covariance=column(rows, "covariance", 2, 2),
         pose_id=ids if ids is not None else tuple(str(i) for i in range(n)),
         seen=seen,
-        status=tuple(_status(row, usual, off) for row in rows),
+        status=tuple(_status(row, usual, settings) for row in rows),
         image=names,
-        snr=column("snr"),
-        semi_major=column("semi_major"),
-        semi_minor=column("semi_minor"),
-        angle=column("angle"),
-        x_ellipse=column("x_ellipse", 2),
+        snr=column(rows, "snr"),
+        semi_major=column(rows, "semi_major"),
+        semi_minor=column(rows, "semi_minor"),
+        angle=column(rows, "angle"),
+        x_ellipse=column(rows, "x_ellipse", 2),
     )
 
 
-def _status(row: Row, usual: Array, off: bool) -> str:
+def _status(row: Row, usual: Array, settings: DetectionSettings) -> str:
     if "x_D" not in row:
         return str(row["reason"])
     flags = [f for f in row["flags"] if f != "moved"]
-    if off and "radius off nominal" not in flags:
+    if row["off"] and "radius off nominal" not in flags:
         flags.append("radius off nominal")
-    if motion_length(np.asarray(row["anisotropy"]) - usual, np.asarray(row["anisotropy_covariance"])) > MOTION:
+    anisotropy, covariance = np.asarray(row["anisotropy"]) - usual, np.asarray(row["anisotropy_covariance"])
+    if motion_length(anisotropy, covariance, row["blur"], settings) > 0:
         flags.append("moved")
     if row["lag"] > 0:
         flags.append(f"lag {100 * row['lag']:.1f} %")

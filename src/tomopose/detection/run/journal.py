@@ -1,58 +1,71 @@
 """An append-only journal of finished images, so that an interrupted run goes on where it stopped.
 
-One JSON line an image, keyed by its name, the content of a sample of its rows and the call's settings: an image or a
-setting that changed is measured again.  A last line cut short by a crash is ignored.
+The first line holds the run's key: scanner, diameter, mask, settings and the versions that calculate.  Each further
+line is one image, with the digest of all its pixels (corrected by flat and dark field, where there are any) and of the
+place where the ball was expected: an image that changed is measured again, and under another key the journal begins
+anew, which a warning says.
+A last line cut short by a crash is ignored.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from tomopose.detection.reading import Image
+from tomopose.detection.run.checks import Row
 from tomopose.errors import FileError
-
-SAMPLED_ROWS = 64
-
-
-def fingerprint(image: Any, settings: str) -> str:
-    """Hash of the settings, the image's shape and type, and of about 64 of its rows, evenly spread."""
-    digest = hashlib.blake2b(settings.encode(), digest_size=16)
-    rows = int(image.shape[0])
-    step = max(1, rows // SAMPLED_ROWS)
-    for v in range(0, rows, step):
-        line = image.region(v, v + 1, 0, image.shape[1]) if hasattr(image, "region") else image[v]
-        digest.update(str(np.asarray(line).dtype).encode() + np.ascontiguousarray(line).tobytes())
-    digest.update(repr(tuple(image.shape)).encode())
-    return digest.hexdigest()
+from tomopose.kept import Key, digest_of, same_key
 
 
-def read_journal(path: Path | None) -> dict[str, dict[str, Any]]:
-    """Finished rows by image name; empty where there is no journal."""
-    if path is None or not path.exists():
-        return {}
-    done = {}
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror or error}", path=path) from error
-    for line in lines:
-        try:
-            row = json.loads(line)
-        except json.JSONDecodeError:
-            continue
-        done[str(row["name"])] = row
-    return done
+def fingerprint(image: Image, predicted: tuple[float, float] | None, origin: tuple[int, int]) -> str:
+    """Digest of an image's pixels, all of them, and of where the ball is expected in it."""
+    rows, columns = getattr(image, "shape", None) or np.shape(image)
+    whole = image.region(0, rows, 0, columns) if hasattr(image, "region") else image
+    pixels: npt.NDArray[np.generic] = np.asarray(whole)
+    return digest_of((pixels, predicted, origin))
 
 
-def append(path: Path, row: dict[str, Any]) -> None:
-    """Adds one finished image and flushes it."""
+def open_journal(path: Path, key: Key) -> dict[str, Row]:
+    """Finished rows by image name of a journal with that key; otherwise it is begun anew, and none are."""
+    rows = _rows(path)
+    kept = Key.from_json(rows[0].get("key")) if rows and "name" not in rows[0] else None
+    if rows and same_key(kept, key, what=f"the journal {path}"):
+        return {str(row["name"]): row for row in rows[1:] if "name" in row}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps({"key": key.to_json()}) + "\n", encoding="utf-8", newline="\n")
+    except OSError as error:
+        raise FileError(f"{path} cannot be written: {error.strerror or error}", path=path) from error
+    return {}
+
+
+def append(path: Path, row: Row) -> None:
+    """Adds one finished image and flushes it."""
+    try:
         with open(path, "a", encoding="utf-8", newline="\n") as stream:
             stream.write(json.dumps(row) + "\n")
     except OSError as error:
         raise FileError(f"{path} cannot be written: {error.strerror or error}", path=path) from error
+
+
+def _rows(path: Path) -> list[Row]:
+    """The journal's lines that are whole."""
+    if not path.exists():
+        return []
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise FileError(f"{path} cannot be read: {error.strerror or error}", path=path) from error
+    rows = []
+    for line in text.splitlines():
+        try:
+            row = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        if isinstance(row, dict):
+            rows.append(row)
+    return rows

@@ -94,14 +94,16 @@ def cone_coordinates(u, v, inverse_K, p_u, p_v, u_c, v_c, gamma):  # type: ignor
 
 
 @njit(cache=True, fastmath=True)
-def follow(rim, du, dv, dgamma):  # type: ignore[no-untyped-def]
-    """Adds to the distances of `rim` (6, n) what a small move of the cone changes, to first order."""
-    for i in range(rim.shape[1]):
-        rim[0, i] += rim[1, i] * du + rim[2, i] * dv + rim[3, i] * dgamma
+def followed(distance, rim, du, dv, dgamma):  # type: ignore[no-untyped-def]
+    """(n,) the distances after a small move of the cone, to first order; rim: (6, n) of cone_coordinates."""
+    out = np.empty(distance.shape[0])
+    for i in range(out.shape[0]):
+        out[i] = distance[i] + rim[1, i] * du + rim[2, i] * dv + rim[3, i] * dgamma
+    return out
 
 
-@njit(cache=True, fastmath=True, inline="always")
-def _direction(c, s):  # type: ignore[no-untyped-def]
+@njit(cache=True, fastmath=True)
+def direction_angle(c, s):  # type: ignore[no-untyped-def]
     """Angle of (c, s) in [0, 2 pi] to 1e-5 rad: where angular nodes lie need not be exact.
 
     Arc tangent: Abramowitz & Stegun, Handbook of Mathematical Functions, 4.4.49.
@@ -115,97 +117,3 @@ def _direction(c, s):  # type: ignore[no-untyped-def]
     if c < 0.0:
         angle = math.pi - angle
     return 2.0 * math.pi - angle if s < 0.0 else angle
-
-
-@njit(cache=True)
-def ring_pixels(window, good, u_first, v_first, u_c, v_c, low, high, ratio_u, ratio_v, every):  # type: ignore[no-untyped-def]
-    """u, v, value (n,) of the good pixels of a window at a distance in [low, high] (square px).
-
-    every: one pixel in so many is taken, on a lattice that has as large a share in each row and column.
-    """
-    return thinned_ring(window, good, u_first, v_first, u_c, v_c, low, high, ratio_u, ratio_v, every, np.inf, high)[:3]
-
-
-@njit(cache=True)
-def thinned_ring(  # type: ignore[no-untyped-def]
-    window, good, u_first, v_first, u_c, v_c, low, high, ratio_u, ratio_v, every, many, near
-):  # fmt: skip
-    """ring_pixels, without every second one of those farther than `near` if there are more than `many`; whether so."""
-    rows, columns = window.shape
-    n, near_square, thinned = 0, np.inf, False
-    for turn in range(2):
-        if turn == 1:
-            u, v, value = np.empty(n), np.empty(n), np.empty(n)
-            thinned = n > many
-            near_square = near * near if thinned else np.inf
-        n = 0
-        for j in range(rows):
-            dv = (j + v_first - v_c) * ratio_v
-            rest = high * high - dv * dv
-            if rest < 0.0:
-                continue
-            middle, reach = u_c - u_first, math.sqrt(rest) / ratio_u
-            gap = low * low - dv * dv if low > 0.0 else -1.0
-            hole = math.sqrt(gap) / ratio_u if gap > 0.0 else -1.0
-            first = math.ceil(min(max(middle - reach, 0.0), float(columns)))
-            last = math.floor(min(max(middle + reach, -1.0), columns - 1.0))
-            for side in range(2):
-                start = first if side == 0 else max(first, math.ceil(min(max(middle + hole, 0.0), float(columns))))
-                inner = math.floor(min(max(middle - hole, -1.0), columns - 1.0))
-                stop = min(last, inner) if side == 0 and hole >= 0.0 else last
-                if side == 1 and hole < 0.0:
-                    break
-                for i in range(start + (-start - 2 * j) % every, stop + 1, every):
-                    if good[j, i]:
-                        du = (i - middle) * ratio_u
-                        if du * du + dv * dv > near_square and (i + u_first + j + v_first) % 2 == 1:
-                            continue
-                        if turn == 1:
-                            u[n], v[n], value[n] = i + u_first, j + v_first, window[j, i]
-                        n += 1
-    return u[:n], v[:n], value[:n], thinned
-
-
-@njit(cache=True, fastmath=True)
-def by_sector(u, v, value, rim, low, high, thin_from, k, edges, more):  # type: ignore[no-untyped-def]
-    """The pixels with s in (low, high), by sector and in it by shell: u, v, value, rim, left (n,), share (n,), first.
-
-    `more` empty rows follow the 6 of rim: memory asked for in one large block stays with the process, and a heap that
-    shrinks and grows with every image costs a millisecond.
-
-    Sector j reaches from angular node j to the next; left is that j, share how far a pixel lies towards the next node.
-    Its shells are cut at the distances `edges` (m,); shell i of it begins at first[j (m + 1) + i], first has
-    k (m + 1) + 1 entries.  Every second pixel with s > thin_from is left out.
-    """
-    turn, shells = k / (2.0 * math.pi), edges.shape[0] + 1
-    cell, part = np.empty(u.shape[0], np.int64), np.empty(u.shape[0])
-    for i in range(u.shape[0]):
-        angle = _direction(rim[4, i], rim[5, i]) * turn
-        node = int(min(max(angle, 0.0), k - 1.0))
-        cell[i], part[i] = node * shells, angle - node
-    first = np.zeros(k * shells + 1, np.int64)
-    for i in range(u.shape[0]):
-        s = rim[0, i]
-        if s > low and s < high and (s < thin_from or (int(u[i]) + int(v[i])) % 2 == 0):
-            for edge in edges:
-                cell[i] += s > edge
-            first[cell[i] + 1] += 1
-        else:
-            cell[i] = -1
-    for j in range(k * shells):
-        first[j + 1] += first[j]
-    n, place = first[k * shells], first.copy()
-    source = np.empty(n, np.int64)
-    for i in range(u.shape[0]):
-        if cell[i] >= 0:
-            source[place[cell[i]]] = i
-            place[cell[i]] += 1
-    new_u, new_v, new_value, share, left = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n, np.int64)
-    new_rim = np.empty((6 + more, n))
-    for at in range(n):
-        i = source[at]
-        new_u[at], new_v[at], new_value[at], share[at], left[at] = u[i], v[i], value[i], part[i], cell[i] // shells
-    for c in range(6):
-        for at in range(n):
-            new_rim[c, at] = rim[c, source[at]]
-    return new_u, new_v, new_value, new_rim, left, share, first
