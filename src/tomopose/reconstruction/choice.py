@@ -181,13 +181,13 @@ def choose(asked: Algorithm | None, s: Situation, scan: LineIntegrals, limits: L
     if not able:
         raise EngineError(f"engine {engine} has no distance-weighted back-projection; FDK needs engine cpu")
     if obstacle and (not part.preview or s.path is None):
-        start = "" if isinstance(asked, FDK) else " as a start"
+        role = "" if isinstance(asked, FDK) else " as a start"
         look = (
             ' For a quick look at what it gives all the same, use algorithm="fdk-preview".'
             if s.path is not None
             else ""
         )
-        raise TrajectoryError(f'FDK{start} is not defined here: {obstacle}. Use algorithm="sart".{look}')
+        raise TrajectoryError(f'FDK{role} is not defined here: {obstacle}. Use algorithm="sart".{look}')
     words = f"{name_of(asked)}: as asked for" + (f", although {obstacle}" if obstacle else "")
     return Choice(algorithm=asked, words=words, redundancy=redundancy)
 
