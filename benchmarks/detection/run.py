@@ -29,6 +29,7 @@ from scipy.ndimage import gaussian_filter
 
 from tomopose import Scanner
 from tomopose.detection import detect, detect_image
+from tomopose.errors import DetectionError
 from tomopose.io.images import open_images
 
 ROWS: list[tuple[str, str, str]] = []
@@ -152,6 +153,45 @@ def other_images(crops: int) -> None:
             f"{np.mean(squares):.2f} +- {1 / np.sqrt(crops):.2f}", "0.9 to 1.1")  # fmt: skip
 
 
+def blurred(crops: int) -> None:
+    """Balls of 10 to 30 px behind a blur of 1.6 to 6 px, total attenuation 4, white noise, against the bound."""
+    from test_detection_blur import SCANNER, blurred_ball, bound
+
+    rng = np.random.default_rng(6)
+    for snr in (50.0, 200.0):
+        ratio, normalised, lost = [], [], 0
+        for radius, blur in (
+            (10, 1.6),
+            (10, 3.0),
+            (10, 6.0),
+            (15, 2.4),
+            (15, 6.0),
+            (20, 3.0),
+            (20, 6.0),
+            (30, 1.6),
+            (30, 6.0),
+        ):
+            u, v = 63.5 + rng.uniform(-4, 4, 2)
+            clean, limit = blurred_ball(radius, blur, (u, v), 4.0), bound(radius, blur, (u, v), 4.0, snr)
+            for _ in range(max(crops // 9, 1)):
+                image = 30000 * (1.0 + clean + rng.normal(0.0, 1 / snr, clean.shape))
+                try:
+                    ball = detect_image(image, SCANNER, ball_diameter=0.08 * radius)
+                except DetectionError:
+                    lost += 1
+                    continue
+                d = ball.x_D - [u, v]
+                ratio.append(d @ np.linalg.solve(limit, d) / 2)
+                normalised.append(d @ np.linalg.solve(ball.covariance, d) / 2)
+        name = f"blurred, radius 10 to 30, blur 1.6 to 6 px, SNR {snr:.0f}"
+        say(name, f"{lost} of {lost + len(ratio)} lost, error / bound {np.sqrt(np.mean(ratio)):.2f}", "0 lost, 1.3")
+        say(
+            "  variance of the normalised errors",
+            f"{np.mean(normalised):.2f} +- {1 / np.sqrt(len(ratio)):.2f}",
+            "0.9 to 1.1",
+        )
+
+
 def third_party(shared: Path) -> None:
     folder = shared / "data" / "ball-radiographs-gvxr"
     known = json.loads((folder / "scanner.json").read_text())
@@ -266,7 +306,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=24, help="frames of the speed figure")
     default = os.environ.get("TOMOPOSE_SHARED", Path(__file__).resolve().parents[3] / "shared")
     parser.add_argument("--shared", type=Path, default=Path(default), help="folder that holds data/")
-    parser.add_argument("--skip", default="", help="bound,kinds,gvxr,speed,memory: those to leave out")
+    parser.add_argument("--skip", default="", help="bound,kinds,blurred,gvxr,speed,memory: those to leave out")
     parser.add_argument("--memory-frames", type=int, default=2000, help="frames of the memory figure")
     parser.add_argument("--memory-child", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -283,6 +323,8 @@ def main() -> None:
         against_the_bound(options.crops, [float(m) for m in options.magnifications.split(",")])
     if "kinds" not in skip:
         other_images(max(options.crops // 8, 40))
+    if "blurred" not in skip:
+        blurred(options.crops)
     if "memory" not in skip:
         memory(options.memory_frames)
 

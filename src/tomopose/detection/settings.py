@@ -1,7 +1,7 @@
 """Every threshold of detection, beside where it comes from.
 
-"Tuned" refers to `benchmarks/detection/thresholds.py`, which prints error / bound and the variance of normalised errors
-for the values of each scan; `flat from a to b` is where both stay within their statistical noise.
+"Tuned" values are those that `benchmarks/detection/thresholds.py` scans: it prints error / bound and the variance of
+normalised errors for several values of each.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class RingSettings(NamedTuple):
     share: float = 0.35
     narrowest: float = 5.0
     widest: float = 22.0
-    """Width outside the rim: this share of the radius, within these limits.  Tuned: flat from 0.25 to 0.5."""
+    """Width outside the rim: this share of the radius, within these limits.  Tuned: thresholds.py scans it."""
     widths: float = 10.0
     """Least width outside, in widths of the blur.  The background's level and slope must be known apart from the edge:
     with both free at every node the centre's standard deviation is 1.67, 1.34, 1.22 and 1.15 times that with a known
@@ -90,7 +90,7 @@ class RingSettings(NamedTuple):
     sharp: float = 1.3
     """Blur up to which the lengths here hold: the first shell then ends 5.4 widths from the rim: the edge is over."""
     shells: tuple[float, float, float] = (7.0, 10.0, 14.0)
-    """Where the ring is cut, for the comparison of smaller rings.  Tuned: flat from 5, 8, 12 to 9, 12, 17."""
+    """Where the ring is cut, for the comparison of smaller rings.  Tuned: thresholds.py scans it."""
     node_distance: float = 9.5
     fewest_nodes: int = 6
     most_nodes: int = 36
@@ -142,11 +142,11 @@ class FitSettings(NamedTuple):
     """Standard deviations by which a sector's chi-square must exceed 1 for its background to count as badly fitted."""
     steepest: float = 6.0
     """Prior: the background changes over the ring by no more than this many standard deviations of the ring's values.
-    Tuned: flat from 3 to 12."""
+    Tuned: thresholds.py scans it."""
     few_bent: float = 0.1
     bent: float = 10.0
     """Prior share of nodes where the background is curved, and its curvature there, in variances of the estimate.
-    Tuned: flat from 0.03 to 0.2, and from 4 to 25."""
+    Tuned: thresholds.py scans it."""
     least_curvature: float = 1e-3
     """Least variance of the curvature's prior, in variances of the estimate: keeps the matrix regular."""
     gross: float = 0.1
@@ -172,7 +172,7 @@ class NoiseSettings(NamedTuple):
     """Standard deviations by which a neighbour's correlation must differ from 0 before noise counts as correlated."""
     smallest: float = 0.06
     """Correlation of neighbours below which noise counts as white: a holder leaves some in the residuals too.
-    Tuned: flat from 0.04 to 0.09."""
+    Tuned: thresholds.py scans it."""
     leak: int = 3
     leak_pixels: int = 50
     """Distance from the rim, px, within which noise is measured px by px, and the pixels that this takes."""
@@ -185,7 +185,7 @@ class NoiseSettings(NamedTuple):
     fewest_pixels: int = 60
     """Pixels below which the noise's correlation cannot be measured."""
     rare: float = 0.1
-    """Prior share of sets of residuals that hold more than noise.  Tuned: flat from 0.03 to 0.3."""
+    """Prior share of sets of residuals that hold more than noise.  Tuned: thresholds.py scans it."""
 
 
 class RingTestSettings(NamedTuple):
@@ -194,8 +194,8 @@ class RingTestSettings(NamedTuple):
     implausible: float = 4.0
     """Chi-square of the difference by its two degrees of freedom from which a ring is too large: 2 % by chance."""
     remaining: float = 0.5
-    """Share of D D' that is added to the smaller ring's covariance, for what its own background leaves out.  Tuned:
-    flat from 0.25 to 1."""
+    """Share of D D' that is added to the smaller ring's covariance, for what its own background leaves out.
+    Tuned: thresholds.py scans it."""
 
 
 class SectorTestSettings(NamedTuple):
@@ -206,7 +206,7 @@ class SectorTestSettings(NamedTuple):
     parts: int = 3
     """Cells that share a sector's width."""
     trusted: float = 0.6
-    """Where every sector keeps this share of its weight, there is no second fit.  Tuned: flat from 0.4 to 0.8."""
+    """Where every sector keeps this share of its weight, there is no second fit.  Tuned: thresholds.py scans it."""
     turns: int = 2
     """A sector that misfits spoils its neighbours: they are judged once more without it."""
     negligible: float = 0.02
