@@ -251,3 +251,27 @@ def test_null_parameters_and_drift_files_are_those_of_ctsimu(tmp_path):
     (tmp_path / "drift.csv").unlink()
     with pytest.raises(FileError, match=r"names the drift file drift\.csv"):
         tp.read_geometry(tmp_path / "a.json")
+
+
+def test_a_circular_openct_file_of_ctsimu_means_the_views_of_its_scenario(tmp_path):
+    from ctsimu.geometry import create_OpenCT_config
+    from ctsimu.scenario import Scenario
+
+    content = json.loads(next(f for f in scenarios() if "2D-WE-2" in f.name).read_text())
+    content["acquisition"] |= {"number_of_projections": 7, "stop_angle": {"value": 360.0, "unit": "deg"}}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    scenario = Scenario(str(tmp_path / "a.json"))
+    P = []
+    for k in range(7):
+        scenario.set_frame(k, reconstruction=True)
+        P.append(np.array(scenario.current_geometry().projection_matrix(mode="CERA").value, dtype=float))
+    scenario.set_frame(0, reconstruction=True)
+    create_OpenCT_config(
+        scenario.current_geometry(),
+        filename=str(tmp_path / "openct.json"),
+        variant="circular",
+        projection_files=[f"{k}.tif" for k in range(7)],
+        total_angle=360.0,
+    )
+    matrices = tp.read_geometry(tmp_path / "openct.json")
+    np.testing.assert_allclose(matrices.project(X / 10), pixels(P, X / 10), rtol=0, atol=1e-6)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from tomopose.errors import ConventionError, InputError, SchemaVersionError, UnitError
-from tomopose.exports.panel import Given, numbers
+from tomopose.exports.panel import Given, matrices_of_panels, numbers
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.units import Array
 
@@ -93,7 +93,8 @@ def _bounding_box(m: ProjectionMatrices) -> dict[str, Any]:
 def from_openct(content: Mapping[str, Any], given: Given, *, where: str = "the openCT file") -> ProjectionMatrices:
     """Matrices of an openCT JSON content.  Its detector frame says how rows count; the images' order has no part.
 
-    Raises InputError where it has no matrices (a circular scan given by angles) or mirrors the detector.
+    A circular scan may state distances and its total angle instead.  Raises InputError where it has neither, or mirrors
+    the detector.
     """
     head = _part(content, "OpenCTJSON", where)
     if not isinstance(head.get("versionMajor"), int) or head["versionMajor"] > NEWEST:
@@ -109,7 +110,7 @@ def from_openct(content: Mapping[str, Any], given: Given, *, where: str = "the o
         )
     table = projections.get("matrices")
     if not table:
-        raise InputError(f"{where} holds no projections.matrices; a circular scan given by angles alone is not read")
+        return _circular(head, projections, geometry, given, where)
     P = numbers(table, (-1, 3, 4), f"{where}: projections.matrices")
     announced = projections.get("numProjections")
     files = _part(projections, "images", where, needed=False).get("files")
@@ -130,6 +131,53 @@ def from_openct(content: Mapping[str, Any], given: Given, *, where: str = "the o
             raise ConventionError(f"{where} lacks projections.{name}; the matrices have no meaning without it")
     A = detector_frame(projections["detectorCoordinateFrame"], projections["detectorCoordinateDimension"], **values)
     return given.matrices(np.linalg.inv(A) @ P, **values)
+
+
+def _circular(
+    head: Mapping[str, Any],
+    projections: Mapping[str, Any],
+    geometry: Mapping[str, Any],
+    given: Given,
+    where: str,
+) -> ProjectionMatrices:
+    """Matrices of the variant CircularTrajectoryCBCTScan, which states distances and the total angle alone.
+
+    The source lies on the x axis of W, the panel's middle on the beam; the object turns by totalAngle / n from view to
+    view, counter-clockwise about z (writers reverse the file names of a clockwise scan).
+    """
+    if head.get("variant") != "CircularTrajectoryCBCTScan":
+        raise InputError(
+            f"{where} holds no projections.matrices, and is not a circular scan (variant CircularTrajectoryCBCTScan)"
+        )
+    if geometry.get("skipAngle") not in (None, 0):
+        raise InputError(
+            f"{where}: skipAngle is {geometry['skipAngle']!r}; whether it turns the first view is not documented"
+        )
+
+    def number(section: Mapping[str, Any], name: str) -> float:
+        if section.get(name) is None:
+            raise InputError(f"{where}: a circular scan needs {name}, which is missing")
+        return float(numbers(section[name], (), f"{where}: {name}"))
+
+    d_SO, d_OD = number(geometry, "distanceSourceObject"), number(geometry, "distanceObjectDetector")
+    total, n = number(geometry, "totalAngle"), int(number(projections, "numProjections"))
+    if not (d_SO > 0 and d_OD >= 0 and n > 0):
+        raise InputError(f"{where}: distances {d_SO:g} and {d_OD:g} mm and {n} projections are no scan")
+    (n_u, n_v), (w, h) = (numbers(geometry.get(k), (2,), f"{where}: {k}") for k in ("detectorPixel", "detectorSize"))
+    values = {"n_u": int(n_u), "n_v": int(n_v), "p_u": float(w) / int(n_u), "p_v": float(h) / int(n_v)}
+    settled = {k: given.settle(k, v, where) for k, v in values.items()}
+    alpha = np.radians(total) * np.arange(n) / n
+    c, s, o, i = np.cos(alpha), np.sin(alpha), np.zeros(n), np.ones(n)
+    beam = np.stack([c, -s, o], axis=-1)
+    return matrices_of_panels(
+        d_SO * beam,
+        -d_OD * beam,
+        settled["p_u"] * np.stack([s, c, o], axis=-1),
+        settled["p_v"] * np.stack([o, o, i], axis=-1),
+        given=given.with_values(**settled),
+        rows="bottom",
+        where=where,
+    )
 
 
 def _part(content: Mapping[str, Any], name: str, where: str, *, needed: bool = True) -> Mapping[str, Any]:

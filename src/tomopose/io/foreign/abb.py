@@ -75,7 +75,8 @@ def read(file: ForeignFile, options: PoseOptions) -> PoseLog:
         source="set" if moves or named else "encoder",
         lines=tuple(t.line for t in chosen),
         notes=notes,
-        **said,
+        pose_id=said.get("pose_id"),
+        alpha=said.get("alpha"),
     )
     return log.with_notes(_frames(file, moves), _external(chosen))
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from tomopose.errors import InputError
 from tomopose.geometry.rotations import convention_from_rotation, exp_rotation, log_rotation
@@ -20,6 +21,8 @@ from tomopose.io.foreign.number_words import number_word
 from tomopose.io.foreign.pose_log import ABSOLUTE, PoseLog, some
 from tomopose.io.foreign.table_cells import read_cells
 from tomopose.units import Array
+
+Indices = npt.NDArray[np.intp]
 
 LONGEST_GAP_S = 1.0
 """s; default of the longest time between two rows of the log across which is interpolated."""
@@ -169,7 +172,7 @@ def _name(moments: Moments, k: int) -> str:
     return f"pose {moments.pose_id[k]}" if moments.pose_id is not None else f"row {k + 1}"
 
 
-def _clock_of(log: PoseLog) -> tuple[Array, Array]:
+def _clock_of(log: PoseLog) -> tuple[Array, Indices]:
     """Rising times of the log and the rows that they belong to."""
     if log.seconds is None or len(log.seconds) < 2 or not log.rows:
         raise InputError(f"{log.path} has no clock (no time stamp or time column): it cannot be joined by time")
@@ -183,7 +186,7 @@ def _clock_of(log: PoseLog) -> tuple[Array, Array]:
     return log.seconds[kept], kept
 
 
-def _at(log: PoseLog, where: Array, left: Array, right: Array, share: Array) -> tuple[tuple[str, ...], ...]:
+def _at(log: PoseLog, where: Indices, left: Indices, right: Indices, share: Array) -> tuple[tuple[str, ...], ...]:
     """Rows at a share of the way from one row to the next; rows of the log itself keep their digits."""
     T = log.poses(units_confirmed=True).T_MH[where]
     x = T.t[left] + share[:, None] * (T.t[right] - T.t[left])
@@ -199,7 +202,7 @@ def _at(log: PoseLog, where: Array, left: Array, right: Array, share: Array) -> 
     return tuple(out)
 
 
-def _largest_step(log: PoseLog, where: Array, left: Array, right: Array, exact: Array) -> float:
+def _largest_step(log: PoseLog, where: Indices, left: Indices, right: Indices, exact: npt.NDArray[np.bool_]) -> float:
     t = log.poses(units_confirmed=True).T_MH.t[where]
     steps = np.linalg.norm(t[right] - t[left], axis=1)
     return float(np.where(exact, 0.0, steps).max(initial=0.0))

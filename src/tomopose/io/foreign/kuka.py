@@ -94,7 +94,8 @@ def _program(file: ForeignFile) -> PoseLog:
         source="set",
         lines=tuple(p.line for p in chosen),
         notes=notes,
-        **said,
+        pose_id=said.get("pose_id"),
+        alpha=said.get("alpha"),
     )
     return log.with_notes(_frame_note(file, [p.name for p in chosen]), _assigned_frames(file))
 

@@ -36,9 +36,9 @@ from tomopose.io.foreign.kind import Kind
 from tomopose.io.foreign.pose_log import PoseLog, PoseOptions, Row
 from tomopose.io.foreign.program_remarks import Remarks
 from tomopose.io.poses_csv import poses_from_table
-from tomopose.io.table_text import NUMBER, TextTable, read_table, read_text
+from tomopose.io.table_text import NUMBER, TextTable, read_table
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.reading import reader
+from tomopose.reading import read_text, reader
 
 AXES = ("X", "Y", "Z", "U", "V", "W")
 COLUMNS = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")
@@ -146,6 +146,7 @@ def _commands(file: ForeignFile) -> PoseLog:
     if any(number > lines[0] for number, _ in pivots):
         raise InputError(f"{file.path}: SPI changes the pivot between two poses; split the list there")
     pivot_words = tuple(pivots[-1][1].get(a, "0") for a in PIVOT_AXES[0]) if pivots else None
+    said = remarks.columns()
     return PoseLog(
         path=file.path,
         convention="pi-hexapod",
@@ -154,7 +155,8 @@ def _commands(file: ForeignFile) -> PoseLog:
         lines=tuple(lines),
         pivot=pivot_words if pivot_words is None else (pivot_words[0], pivot_words[1], pivot_words[2]),
         notes=("commands without replies: these are the set poses",),
-        **remarks.columns(),
+        pose_id=said.get("pose_id"),
+        alpha=said.get("alpha"),
     )
 
 

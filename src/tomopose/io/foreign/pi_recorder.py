@@ -92,7 +92,7 @@ def _header(file: ForeignFile) -> tuple[dict[str, str], list[str], int]:
             break
         if found := HEADER.match(line):
             keys[found["key"]] = found["value"]
-    names = []
+    names: list[str] = []
     while f"NAME{len(names)}" in keys:
         names.append(keys[f"NAME{len(names)}"])
     if "DIM" in keys and int(keys["DIM"]) != len(names):

@@ -159,7 +159,7 @@ def visiting_order(declared: Sequence[str], visited: Sequence[str]) -> tuple[lis
     if not known:
         return list(declared), ()
     left = [name for name in declared if name not in known]
-    notes = (f"points that no move visits are left out: {some(left)}",) if left else ()
+    notes: tuple[str, ...] = (f"points that no move visits are left out: {some(left)}",) if left else ()
     if known != [name for name in declared if name in known]:
         notes += ("the poses stand in the order of the moves, not of the declarations",)
     return known, notes

@@ -30,7 +30,8 @@ def read(file: ForeignFile) -> ScannerDraft:
     d_SD, d_SR = ini.number("Camera to Source (mm)"), ini.number("Object to Source (mm)")
     camera, image = ini.number("Camera Pixel Size (um)"), ini.number("Image Pixel Size (um)")
     ratio = ini.number("CameraXYRatio") or ini.number("Camera X/Y Ratio") or 1.0
-    readings, notes = [], []
+    readings = []
+    notes: list[str] = []
     at_camera = image * d_SD / d_SR if image and d_SD and d_SR else None
     found = BINNING.search(ini.word("Camera binning") or "")
     if camera and at_camera and found and compared(at_camera, camera, "", ""):

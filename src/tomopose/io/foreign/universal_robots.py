@@ -94,7 +94,8 @@ def _chosen(
         source="set" if moves or named else "encoder",
         lines=tuple(line for _, line in rows),
         notes=notes,
-        **said,
+        pose_id=said.get("pose_id"),
+        alpha=said.get("alpha"),
     )
 
 

@@ -33,7 +33,7 @@ def read(file: ForeignFile) -> ScannerDraft:
     except ImportError as error:
         raise EngineMissingError(
             f"{file.path} is a Zeiss Xradia file; reading it needs the package olefile",
-            install_line="pip install olefile",
+            install_line="pip install 'tomopose[zeiss]'",
         ) from error
     with reading(file.path, "Xradia file (truncated?)"), olefile.OleFileIO(str(file.path)) as ole:
         said = {name: _stream(ole, f"ImageInfo/{name}", kind) for name, kind in STREAMS.items()}
