@@ -207,14 +207,14 @@ def deferred_signals() -> Iterator[None]:
         yield
         return
     came: list[tuple[int, FrameType | None]] = []
-    before = {s: signal.signal(s, lambda number, frame: came.append((number, frame))) for s in _INTERRUPTS}
+    before = {int(s): signal.signal(s, lambda number, frame: came.append((number, frame))) for s in _INTERRUPTS}
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
         for number, frame in came[:1]:
-            handler = before[signal.Signals(number)]
+            handler = before[number]
             if callable(handler):
                 handler(number, frame)
             elif handler == signal.SIG_DFL:

@@ -10,9 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError, ShapeError
+from tomopose.geometry.scanner import Scanner
 from tomopose.units import Array, float_array, rows_at
 from tomopose.values import Column, Rows, value
 
+OUTSIDE = 1.0
+"""Of the panel's side.  Simulated centres may leave the panel, by a third of it in practice; a mistyped number, or a
+column of another kind, leaves it by more."""
 OPTIONAL_COLUMNS = ("snr", "semi_major", "semi_minor", "angle")
 
 
@@ -152,6 +156,24 @@ class BallObservations(Rows):
         if self.semi_major is None or self.semi_minor is None:
             return None
         return np.asarray(self.semi_major * self.semi_minor, dtype=np.float64)
+
+    def require_on_panel(self, scanner: Scanner, where: str) -> BallObservations:
+        """The observations, if all that are used lie on the scanner's panel; InputError names the first that does not.
+
+        Centres may lie outside by `OUTSIDE` of the panel's side.
+        """
+        sides = np.array([scanner.n_u, scanner.n_v])
+        low, high = -0.5 - OUTSIDE * sides, sides - 0.5 + OUTSIDE * sides
+        off = self.seen & ~((self.x_D >= low) & (self.x_D <= high)).all(axis=1)
+        if off.any():
+            k = int(np.flatnonzero(off)[0])
+            u, v = self.x_D[k]
+            raise InputError(
+                f"{where}: row {k + 1} (pose {self.pose_id[k]!r}) is at u {u:.6g}, v {v:.6g} px, off the panel of "
+                f"{scanner.n_u} x {scanner.n_v} pixels ({int(off.sum())} of {len(self)} rows are): are these pixels of "
+                "this scanner, unbinned?"
+            )
+        return self
 
     @property
     def used(self) -> BallObservations:

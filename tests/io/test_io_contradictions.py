@@ -245,3 +245,13 @@ def test_encoders_near_zero_are_no_other_unit(tmp_path):
             lines[k] = ",".join(cells)
 
     assert len(read_poses(poses_with(tmp_path, change))) > 100
+
+
+@pytest.mark.parametrize("at", [(-1600.0, 500.0), (3100.0, 500.0), (700.0, 1e5)])
+def test_observations_off_the_panel_are_refused(scanner, at):
+    observations = BallObservations.from_sigma(
+        np.array([[700.0, 500.0], at]), np.array([0.02, 0.02]), pose_id=("a", "b")
+    )
+    with pytest.raises(InputError, match=r"o\.csv: row 2 \(pose 'b'\) is at .* off the panel of 1501 x 1203"):
+        observations.require_on_panel(scanner, "o.csv")
+    assert len(observations.select([0]).require_on_panel(scanner, "o.csv")) == 1

@@ -157,6 +157,7 @@ def read_inputs(o: CalibrationOptions) -> Inputs:
     images = None
     if o.observations is not None:
         observations = tp.read_observations(o.observations).with_ball_diameter(o.ball_diameter)
+        observations.require_on_panel(scanner, str(o.observations))
     else:
         images = open_for(
             o.say, image_source(str(o.images)), scanner, poses,

@@ -78,7 +78,7 @@ def read_matrices(path: str | Path) -> ProjectionMatrices:
         scanner = None
         if "scanner" in content:
             scanner = scanner_from_document(parse_json(str(content["scanner"]), f"{path}: scanner"), "scanner")
-        found = ProjectionMatrices(
+        matrices = ProjectionMatrices(
             P=content["P"],
             n_u=int(content["n_u"]),
             n_v=int(content["n_v"]),
@@ -89,7 +89,7 @@ def read_matrices(path: str | Path) -> ProjectionMatrices:
             in_front=content.get("in_front_mm", np.zeros(3)),
             **{name: content.get(key) for key, name in SIGMA.items()},
         )
-        _require_scanner_of(found, str(path))
+        _require_scanner_of(matrices, str(path))
     except InputError as error:
         raise error if str(error).startswith(str(path)) else InputError(f"{path}: {error}") from error
     except (TypeError, ValueError, AttributeError) as error:
@@ -97,7 +97,7 @@ def read_matrices(path: str | Path) -> ProjectionMatrices:
     digest = content.get(DIGEST)
     if digest is not None and str(digest) != _digest(content):
         warn_edited(path)
-    return found
+    return matrices
 
 
 @reader("matrices.npz")

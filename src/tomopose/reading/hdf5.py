@@ -11,11 +11,15 @@ import math
 import os
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tomopose.errors import FileError
 from tomopose.reading.border import require_file
 from tomopose.reading.child import asked_apart
 from tomopose.reading.memory import LARGEST_RATIO, MOST_UNPROVEN, in_gigabytes
+
+if TYPE_CHECKING:
+    import h5py
 
 MOST_OBJECTS = 100_000
 LARGEST_ATTRIBUTE = 64 * 2**20
@@ -69,11 +73,10 @@ def look_at(path: Path) -> int:
         return len(seen)
 
 
-def _linked(path: Path, group: object, name: str) -> object:
+def _linked(path: Path, group: h5py.Group, name: str) -> h5py.HLObject | None:
     """The object behind a name; None for a soft link to nothing.  FileError for a link into another file."""
     import h5py
 
-    assert isinstance(group, h5py.Group)
     link = group.get(name, getlink=True)
     if isinstance(link, h5py.ExternalLink):
         raise FileError(f"{path}: {name!r} leads to another file ({link.filename!r})", path=path)

@@ -143,7 +143,7 @@ def _write_frame(stream: int, lines: Image, offsets: list[int]) -> None:
         chunk = np.zeros((height, lines.shape[1]), dtype=lines.dtype)
         piece = lines[i * height : (i + 1) * height]
         chunk[: len(piece)] = piece
-        left = memoryview(chunk.reshape(-1).view(np.uint8))
+        left = memoryview(chunk.tobytes())
         while left:
             written = os.pwrite(stream, left, offset)
             left, offset = left[written:], offset + written
