@@ -23,7 +23,7 @@ from tomopose.manipulator.real_poses import Repeatability
 from tomopose.manipulator.serial import poses_from_joints
 from tomopose.manipulator.virtual import Disturbance, real_motion
 
-SCANNER = Scanner(d_SD=1500.0, d_SR=283.5, p_u=0.2, p_v=0.2, u_0=1021.37, v_0=1026.81, n_u=2048, n_v=2048)
+SCANNER = Scanner(d_SD=1500.0, d_SR=283.5, p_u=0.2, p_v=0.2, u_0=1021.37, v_0=1026.81, n_u=2048, n_v=2048).exact()
 """Magnification 5.3 of the paper."""
 DETECTION_PX = 0.0207
 """rms distance of detected centres from the true ones, table 1: both coordinates together."""

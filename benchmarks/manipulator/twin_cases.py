@@ -17,7 +17,7 @@ from tomopose.manipulator.real_poses import moved
 from tomopose.manipulator.serial import SerialRobot, poses_from_joints
 from tomopose.manipulator.twin import TwinRobots
 
-SCANNER = Scanner(d_SD=700.0, d_SR=320.0, p_u=0.2, p_v=0.25, u_0=733.4, v_0=512.7, n_u=1501, n_v=1203)
+SCANNER = Scanner(d_SD=700.0, d_SR=320.0, p_u=0.2, p_v=0.25, u_0=733.4, v_0=512.7, n_u=1501, n_v=1203).exact()
 """Non-square pixels, off-centre piercing point."""
 SIGMA_PX = 0.0207 / np.sqrt(2)
 BALL = np.array([6.0, -5.0, 7.0])

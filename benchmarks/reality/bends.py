@@ -218,10 +218,14 @@ BENDS: list[Bend] = [
         [("3 um", 3e-3), ("30 um", 3e-2)],
         lambda w, rng, n, v: setattr(w, "slip", (int(0.6 * n), v * _unit(rng))),
     ),
-    *_world("bump at 40 %", ("mount", "step"), [("5 um", 5e-3), ("100 um", 0.1)], _bump(0.4)),
-    *_world("bump at 93 %", ("mount", "step", "moved"), [("20 um", 2e-2), ("100 um", 0.1)], _bump(0.93)),
-    *_world("bump before the last 4", ("mount", "step", "moved", "ball"), [("20 um", 2e-2), ("100 um", 0.1)], _bump(4)),
-    *_data("closing pose", ("repeat", "again", "last", "closing"), [("0.2 px", 0.2), ("2 px", 2.0)], _closing),
+    *_world("bump at 40 %", ("mount", "moved", "jumped", "slipped"), [("5 um", 5e-3), ("100 um", 0.1)], _bump(0.4)),
+    *_world("bump at 93 %", ("mount", "moved", "jumped", "slipped"), [("20 um", 2e-2), ("100 um", 0.1)], _bump(0.93)),
+    *_world(
+        "bump before the last 4", ("mount", "moved", "jumped", "slipped"), [("20 um", 2e-2), ("100 um", 0.1)], _bump(4)
+    ),
+    *_data(
+        "closing pose", ("repeat", "again", "last", "closing", "set aside"), [("0.2 px", 0.2), ("2 px", 2.0)], _closing
+    ),
     *_data("gross outliers", (), [("3 %", 0.03), ("8 %", 0.08)], _outliers),
     *_data("sigma understated", (), [("half", 0.5)], lambda d, rng, v: setattr(d, "sigma", v * d.sigma)),
     *_data("Euler order", ("order", "convention", "R_z"), [("reversed", 0)], _order),

@@ -43,7 +43,7 @@ from tomopose.planning.limits import PlanLimits
 from tomopose.planning.target import scan_target
 from tomopose.trajectory.pose_grid import pose_grid
 
-SCANNER = Scanner(d_SD=1500.0, d_SR=283.5, p_u=0.2, p_v=0.2, u_0=1021.37, v_0=1026.81, n_u=2048, n_v=2048)
+SCANNER = Scanner(d_SD=1500.0, d_SR=283.5, p_u=0.2, p_v=0.2, u_0=1021.37, v_0=1026.81, n_u=2048, n_v=2048).exact()
 FAR = replace(SCANNER, d_SR=555.0)
 MOUNT = RigidTransform.from_angles([0.007, -0.005, 3.126], [2.0, -1.5, 1.0], source=Frame.H, target=Frame.T)
 BALL, NEAR = np.array([8.0, -6.0, 17.0]), np.array([0.6, -0.5, 0.6])

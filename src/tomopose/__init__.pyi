@@ -25,7 +25,6 @@ from .calibration.records.compare import compare as compare
 from .calibration.records.history import append_history as append_history
 from .calibration.records.history import read_history as read_history
 from .calibration.records.truth import d_rms_exact as d_rms_exact
-from .calibration.result import Assumed as Assumed
 from .calibration.result import Calibration as Calibration
 from .calibration.result import ModelComparison as ModelComparison
 from .calibration.result import ModelJudgement as ModelJudgement
@@ -204,3 +203,8 @@ from .volume import Volume as Volume
 from .volume import VoxelGrid as VoxelGrid
 
 __version__: str
+from .calibration.checks.scanner_tests import Explanation as Explanation
+from .calibration.model.assumed import Assumed as Assumed
+from .calibration.model.budget import ScanBudget as ScanBudget
+from .calibration.model.unseen import Unseen as Unseen
+from .calibration.rigid.contradiction import Contradicted as Contradicted

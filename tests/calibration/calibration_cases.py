@@ -15,7 +15,7 @@ SIGMA = 0.0146
 
 BALL = np.array([8.0, -6.0, 17.0])
 MOUNT = RigidTransform.from_angles([0.007, -0.005, 3.126], [2.0, -1.5, 1.0], source=Frame.H, target=Frame.T)
-SCANNER = Scanner(d_SD=1500.0, d_SR=283.5, p_u=0.2, p_v=0.21, u_0=1021.37, v_0=996.81, n_u=2048, n_v=1999)
+SCANNER = Scanner(d_SD=1500.0, d_SR=283.5, p_u=0.2, p_v=0.21, u_0=1021.37, v_0=996.81, n_u=2048, n_v=1999).exact()
 SINGLE_AXIS = np.array([[0, 0, 0], [5, 0, 0], [-5, 0, 0], [0, 5, 0], [0, -5, 0], [0, 0, 5], [0, 0, -5.0]])
 
 

@@ -7,13 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tomopose.calibration.checks.convention_tests import Diagnosis, Hypothesis
 from tomopose.calibration.checks.evidence.evidence import AgainstRigid, BallSize, Evidence, ScatterFound
 from tomopose.calibration.checks.rules import ARRANGEMENTS, MODELS, RULES, findings, rules_table
+from tomopose.calibration.checks.scanner_tests import Explanation, Ranked, ScannerTests, Single
 from tomopose.calibration.checks.stability import Effect, OutlierBlock, RepeatedPose, Stability
 from tomopose.calibration.checks.verdict import VERDICTS, Finding, judge
+from tomopose.calibration.rigid.contradiction import Contradicted
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "concepts" / "verdict.md"
 CASES = [(rule, model, arrangement) for rule in RULES for model in rule.models for arrangement in rule.arrangements]
@@ -96,6 +99,32 @@ def repeat(e: Evidence) -> Stability:
     return replace(e.stability, repeats=(RepeatedPose(first="0", again="188", distance_px=2.0, sigmas=70.0),))
 
 
+def explained(name: str, kind: str, at: str = "") -> Explanation:
+    return Explanation(name=name, words=name, evidence=40.0, share=0.9, size=np.ones(1), kind=kind, at=at)
+
+
+def run_tests(
+    *, left: Explanation | None = None, single: tuple[str, str, float] | None = None, other: str = ""
+) -> ScannerTests:
+    """Tests of a run: what is left beside everything assumed; a scanner value of that size and another effect which
+    explain equally well why the declared values do not fit."""
+    equal = () if single is None else ((single[0], single[1], single[2]), (other, "manipulator", 1e-3))
+    singles = tuple(Single(name=n, short=n, kind=k, evidence=60.0, size=s) for n, k, s in equal)
+
+    def ranked(chosen: tuple[Explanation, ...]) -> Ranked:
+        return Ranked(chosen=chosen, first=chosen, single=singles, chi2=400.0, left=370.0, dof=370)
+
+    beside = ranked(() if left is None else (left,))
+    return ScannerTests(beside=beside, declared=ranked(()), gain=60.0, sigma={"d_SR": 0.15})
+
+
+def test_a_value_within_what_was_assumed_of_it_is_the_likelier_of_two_explanations():
+    assert run_tests(single=("d_SR", "scanner", 0.4), other="translation_scale").rivals == ()
+    assert [r.name for r in run_tests(single=("d_SR", "scanner", 0.5), other="translation_scale").rivals] == [
+        "translation_scale"
+    ]
+
+
 def met(name: str, e: Evidence) -> Mapping[str, Any]:
     """What meets the condition of a rule."""
     assert e.stability is not None
@@ -125,6 +154,10 @@ def met(name: str, e: Evidence) -> Mapping[str, Any]:
         "contradicted prior": {"prior_pulls": (("u_0", 0.5), ("v_0", -21.0))},
         "drift": moved(e, at=""),
         "step": moved(e, at="100"),
+        "changed during the run": {"tests": run_tests(left=explained("mount step", "step", at="56"))},
+        "scanner or manipulator not as modelled": {"tests": run_tests(left=explained("radial distortion", "panel"))},
+        "value freed": {"contradicted": (Contradicted(name="d_SR", stated=0.15, off=0.9),)},
+        "two explanations": {"tests": run_tests(single=("d_SR", "scanner", 0.9), other="translation_scale")},
         "repeated pose": {"stability": repeat(e)},
         "repeated pose, set aside": {"stability": repeat(e), "outliers": ("188",)},
         "held-out poses": {"stability": replace(e.stability, held_out_rms=0.09, held_out_chi2=20.0)},

@@ -200,7 +200,7 @@ def test_slipped_ball_is_told() -> None:
 
 def carm(rng: np.random.Generator, *, n: int = 150) -> tuple[Scanner, PoseSequence, RigidTransform, np.ndarray]:
     """A hexapod carries source and detector about a standing ball; non-square pixels, off-centre piercing point."""
-    scanner = Scanner(d_SD=1200.0, d_SR=310.0, p_u=0.2, p_v=0.25, u_0=733.4, v_0=512.7, n_u=1501, n_v=1203)
+    scanner = Scanner(d_SD=1200.0, d_SR=310.0, p_u=0.2, p_v=0.25, u_0=733.4, v_0=512.7, n_u=1501, n_v=1203).exact()
     poses = PoseSequence.from_table(rng.uniform(-12, 12, (n, 3)), rng.uniform(-6, 6, (n, 3)))
     T_MT = RigidTransform.from_angles([0.02, -0.01, 0.03], [3.0, 1.0, -2.0], source=Frame.H, target=Frame.T)
     return scanner, poses, T_MT, np.array([4.0, -6.0, 5.0])

@@ -44,6 +44,7 @@ class Files:
 
 @pytest.fixture
 def files(tmp_path, scanner, T_HT, rng) -> Files:
+    scanner = scanner.exact()
     n = 30
     poses = tp.PoseSequence.from_table(
         rng.uniform(-9, 9, (n, 3)),

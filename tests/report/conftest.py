@@ -60,7 +60,7 @@ def sample() -> Callable[..., tuple[Calibration, BallObservations, PoseSequence]
     def make(
         *, turns: tuple[float, ...] = (0.0, np.pi / 2), verdict: str = "trustworthy", outliers: int = 2
     ) -> tuple[Calibration, BallObservations, PoseSequence]:
-        scanner = Scanner(d_SD=1500.0, d_SR=283.5, p_u=0.2, p_v=0.21, u_0=1021.4, v_0=980.8, n_u=2049, n_v=1953)
+        scanner = Scanner(d_SD=1500.0, d_SR=283.5, p_u=0.2, p_v=0.21, u_0=1021.4, v_0=980.8, n_u=2049, n_v=1953).exact()
         T_HT = RigidTransform.from_angles([0.02, -0.03, 3.05], [2.0, -1.5, 4.0], source=Frame.H, target=Frame.T)
         poses = grid_poses(turns)
         exact = predicted(scanner, T_HT, poses, np.zeros(9))

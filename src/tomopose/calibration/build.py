@@ -11,25 +11,28 @@ from tomopose.calibration.checks.ball_size import chain_matrices, measured_ball_
 from tomopose.calibration.checks.convention_tests import Diagnosis
 from tomopose.calibration.checks.evidence.evidence import AgainstRigid, BallSize, Evidence, ScatterFound
 from tomopose.calibration.checks.rules import findings
+from tomopose.calibration.checks.scanner_tests import ScannerTests
 from tomopose.calibration.checks.stability import stability
+from tomopose.calibration.model.assumed import Assumed
 from tomopose.calibration.model.covariance import angles_by_tangent
 from tomopose.calibration.model.linear_fit import LinearFit
-from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, base_name, unit_of
+from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, unit_of
 from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.model.unseen import Unseen
 from tomopose.calibration.result import (
     Arrangement,
-    Assumed,
     Calibration,
     ModelComparison,
     Parameter,
     PoseNoiseFound,
     ViewDistances,
 )
+from tomopose.calibration.rigid.contradiction import Contradicted
 from tomopose.calibration.rigid.fit import tangent_names
 from tomopose.calibration.rigid.observability import Observability
-from tomopose.calibration.uncertainty.tilted_scan import tilted_scan_sigma
+from tomopose.calibration.uncertainty.scan_budget import scan_budget
 from tomopose.geometry.rotations import angles_from_rotation
-from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
+from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.error_models import Errors
 from tomopose.provenance import Provenance
@@ -60,6 +63,9 @@ class Fitted:
     expected_px, stated_px: d_rms that the covariances in use and the stated ones explain.
     magnification_at_ball: mean of d_SD over the ball's distance.
     view_matrices: (n, 3, 4) from the balls' frame to pixels of the rows used, where source and panel move apart.
+    assumed:      of the scanner;  contradicted: values of it that were freed.
+    tests:        one effect after the other, or None where they do not apply.
+    unseen, budget: as of the result.
     """
 
     everything: Problem
@@ -95,6 +101,10 @@ class Fitted:
     views: ViewDistances | None = None
     magnification_at_ball: float | None = None
     view_matrices: Array | None = None
+    assumed: tuple[Assumed, ...] = ()
+    contradicted: tuple[Contradicted, ...] = ()
+    tests: ScannerTests | None = None
+    unseen: Unseen | None = None
     provenance: Provenance | None = None
 
 
@@ -121,7 +131,10 @@ def build(f: Fitted) -> Calibration:
         arrangement=f.arrangement,
         errors=f.errors,
         priors=dict(zip(f.free.names, (float(s) for s in f.free.sigma), strict=True)),
-        assumed=assumed_of(used.scanners[0], f.free),
+        assumed=f.assumed,
+        contradicted=f.contradicted,
+        explanations=() if f.tests is None else f.tests.explanations,
+        unseen=f.unseen,
         converged=f.converged,
         status=f.status,
         hypotheses=f.diagnosis.hypotheses if f.diagnosis else (),
@@ -136,6 +149,7 @@ def build(f: Fitted) -> Calibration:
         convention=used.convention,
         provenance=f.provenance,
     )
+    result = replace(result, budget=scan_budget(result, used, f.linear))
     result = replace(result, stability=stability(f.linear, f.T_HT.R, f.everything, f.keep))
     evidence = evidence_of(f, result)
     judged = replace(result, checks=findings(evidence))
@@ -164,7 +178,9 @@ def evidence_of(f: Fitted, result: Calibration) -> Evidence:
         residual_px=result.d_rms,
         expected_px=f.stated_px,
         spread_px=float(np.sqrt(np.mean(np.sum((x - x.mean(axis=0)) ** 2, axis=1)))),
-        scan_px=tilted_scan_sigma(result, f.linear.problem),
+        scan_px=None if result.budget is None else result.budget.measured,
+        tests=f.tests,
+        contradicted=f.contradicted,
         diagnosis=f.diagnosis,
         stability=result.stability,
         scatter=more.scatter,
@@ -208,21 +224,6 @@ def parameter_list(f: Fitted) -> tuple[Parameter, ...]:
         for n, v, s, unit in zip(names, values, u[3:], units, strict=True)
     ]
     return tuple(result)
-
-
-def assumed_of(scanner: Scanner, free: FreeParameters) -> tuple[Assumed, ...]:
-    """The scanner parameters that were taken with the standard uncertainty that scanner.json states; 0 is exact."""
-    freed = {base_name(name) for name in free.names}
-    return tuple(
-        Assumed(
-            name=name,
-            sigma=float(sigma),
-            unit=PARAMETER_UNITS[name],
-            source="exact" if sigma == 0 else "scanner.json",
-        )
-        for name, sigma in scanner.sigma.items()
-        if name in freed or sigma == 0
-    )
 
 
 def expected_px(linear: LinearFit) -> float:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from tomopose.calibration.result import Calibration
-from tomopose.calibration.uncertainty.propagation import field_of_view_points, matrix_point_sigma
-from tomopose.calibration.uncertainty.trajectory import scatter_variance, trajectory_sigma
+from tomopose.calibration.uncertainty.propagation import field_of_view_points
+from tomopose.calibration.uncertainty.trajectory import scatter_variance, shared_variance
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
 from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.manipulator.error_models import RigidErrors, corrected_poses
+from tomopose.manipulator.error_models import corrected_poses
 from tomopose.manipulator.poses import PIVOT_TOLERANCE_MM, PoseSequence
 from tomopose.units import Array
 
@@ -38,9 +37,13 @@ def require_same_scanner(calibration: Calibration, scanner: Scanner) -> None:
     """InputError, naming the parameter, where a scan's scanner is not the calibration's."""
     own = calibration.scanner
     freed = {p.name for p in calibration.parameters}
+    # what was estimated with a prior is compared with the value that the prior was about
+    given = {a.name: a.value for a in calibration.assumed}
     for name in ("n_u", "n_v", *PARAMETER_UNITS):
-        a, b = getattr(own, name), getattr(scanner, name)
-        if name in freed or (name == "p_u" and "pitch_ratio" in freed):
+        a, b = given.get(name, getattr(own, name)), getattr(scanner, name)
+        if (name not in given and name in freed) or (name == "p_u" and "pitch_ratio" in freed):
+            continue
+        if b == getattr(own, name):
             continue
         if abs(a - b) > SCANNER_TOLERANCE * max(1.0, abs(a)):
             raise InputError(
@@ -50,24 +53,13 @@ def require_same_scanner(calibration: Calibration, scanner: Scanner) -> None:
 
 
 def _point_sigma(
-    calibration: Calibration, commanded: PoseSequence, poses: PoseSequence, x_M: Array, home: RigidTransform
+    calibration: Calibration, commanded: PoseSequence, poses: PoseSequence, x_M: Array
 ) -> tuple[Array, Array]:
     """(n, m) px of points x_M (m, 3): in the single view, and the part that all views share.
 
-    With identified errors of the manipulator, mount and errors share what no measurement depends on, a rigid pose of
-    the object; it is removed there.
+    Both are what a volume sees: a rigid pose of the object, on which no measurement depends, is taken out.
     """
-    R_HT, t_HT = calibration.T_HT.R, calibration.T_HT.t
-    if not isinstance(calibration.errors, RigidErrors):
-        x_W = calibration.scanner.T_TW(0.0).apply(x_M @ R_HT.T + t_HT)
-        shared = np.sqrt(np.mean(trajectory_sigma(calibration, commanded, x_W, scatter=False) ** 2, axis=2))
-    else:
-        # the plate's frame moved to where it equals H at home, for which that function is written
-        x_H = home.apply(x_M)
-        R = poses.T_MH.R @ home.R.T
-        from_home = replace(poses, T_MH=replace(poses.T_MH, R=R, t=poses.T_MH.t - R @ home.t))
-        x_W = calibration.scanner.T_TW(0.0).apply(x_H @ R_HT.T + t_HT)
-        shared = matrix_point_sigma(calibration, from_home, x_W)
+    shared = np.sqrt(np.maximum(np.mean(shared_variance(calibration, commanded, x_M), axis=2), 0.0))
     own = np.mean(scatter_variance(calibration, poses, x_M), axis=2)
     return np.sqrt(shared**2 + own), shared
 
@@ -119,7 +111,7 @@ def projection_matrices(
     else:  # at this home the field of view holds another part of the world than in the scan
         first = own.T_TW(float(alpha[0])) @ calibration.T_HT @ poses.T_MH[0]
         x_M = first.inv.apply(field_of_view_points(own))
-    sigma, shared = _point_sigma(calibration, commanded, poses, x_M, T_0)
+    sigma, shared = _point_sigma(calibration, commanded, poses, x_M)
     matrices = ProjectionMatrices(
         P=P,
         n_u=own.n_u,

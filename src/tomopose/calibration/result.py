@@ -9,8 +9,13 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 
 from tomopose.calibration.checks.convention_tests import Hypothesis
+from tomopose.calibration.checks.scanner_tests import Explanation
 from tomopose.calibration.checks.stability import Stability
 from tomopose.calibration.checks.verdict import Finding, Verdict, judge
+from tomopose.calibration.model.assumed import Assumed
+from tomopose.calibration.model.budget import ScanBudget
+from tomopose.calibration.model.unseen import Unseen
+from tomopose.calibration.rigid.contradiction import Contradicted
 from tomopose.calibration.rigid.observability import Observability
 from tomopose.errors import ShapeError
 from tomopose.geometry.frames import Frame
@@ -22,7 +27,6 @@ from tomopose.units import Array, float_array
 
 Arrangement: TypeAlias = Literal["moving-object", "moving-scanner", "twin"]
 ARRANGEMENTS: tuple[Arrangement, ...] = get_args(Arrangement)
-Source: TypeAlias = Literal["scanner.json", "default", "exact"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,28 +40,16 @@ class Parameter:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Assumed:
-    """A parameter that was taken with a standard uncertainty rather than measured, and who said so.
-
-    source: "scanner.json" (the user's number), "default" (nobody stated any), "exact" (the user's 0).
-    """
-
-    name: str
-    sigma: float
-    unit: str
-    source: Source
-
-
-@dataclass(frozen=True, kw_only=True)
 class PoseNoiseFound:
-    """PoseScatter of the poses beside detection noise, a coordinate each: translation mm, rotation rad; gain: how much
-    -2 log L falls by it; chi2/dof with it and without."""
+    """Scatter of the poses beside detection noise, a coordinate each: translation mm, rotation rad; gain: how much
+    -2 log L falls by it; chi2/dof with it and without; found: the residuals show it, else they leave room for it."""
 
     translation_mm: float
     rotation_rad: float
     gain: float
     chi2_dof_with: float
     chi2_dof_without: float
+    found: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,6 +120,10 @@ class Calibration:
     errors:       the manipulator's: RigidErrors, IdentifiedErrors, EmpiricalErrors or TwinErrors.
     priors:       freed parameter -> prior standard deviation; inf where it had none.
     assumed:      what was taken with a standard uncertainty rather than measured.
+    unseen:       errors of table and manipulator that no ball shows, with their priors; None: none apply.
+    explanations: what explains best why the values as declared do not fit, and what is left, likeliest first.
+    contradicted: values that were freed because the images contradict the sigma that was stated or assumed.
+    budget:       what the uncertainty of a scan is made of.
     status:       a sentence; converged: whether an optimum was reached.
     checks:       the findings; `verdict` and `reasons` follow from them and from nothing else.
     hypotheses:   alternative conventions tried, ranked.
@@ -157,6 +153,10 @@ class Calibration:
     errors: Errors = field(default_factory=RigidErrors)
     priors: Mapping[str, float] = field(default_factory=dict)
     assumed: tuple[Assumed, ...] = ()
+    unseen: Unseen | None = None
+    explanations: tuple[Explanation, ...] = ()
+    contradicted: tuple[Contradicted, ...] = ()
+    budget: ScanBudget | None = None
     converged: bool = True
     status: str = ""
     checks: tuple[Finding, ...] = ()

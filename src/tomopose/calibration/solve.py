@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,11 @@ from tomopose.calibration.checks.alternative import Alternative
 from tomopose.calibration.checks.convention_tests import Diagnosis, ranked, set_pose_alternative
 from tomopose.calibration.checks.conventions import ALTERNATIVES
 from tomopose.calibration.checks.placement import require_on_panel
+from tomopose.calibration.checks.scanner_tests import ScannerTests, rows_to_test, scanner_tests
+from tomopose.calibration.model.assumed import Assumed, assumed_for, with_assumed, without_effect
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS
-from tomopose.calibration.model.covariance import widening
+from tomopose.calibration.model.covariance import inverse_information, widening
+from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import (
     UNITS,
     FreeParameters,
@@ -24,7 +27,9 @@ from tomopose.calibration.model.parameters import (
     translation_scale,
 )
 from tomopose.calibration.model.problem import pair
+from tomopose.calibration.model.unseen import Unseen, unseen_columns, unseen_gain, unseen_names
 from tomopose.calibration.result import Arrangement, Calibration, PoseNoiseFound
+from tomopose.calibration.rigid.contradiction import NOTHING_FITS, Contradicted, contradicted
 from tomopose.calibration.rigid.estimate import Solution, solve, with_pose_noise
 from tomopose.calibration.rigid.fit import blocks, linear_fit
 from tomopose.calibration.rigid.observability import observability
@@ -32,6 +37,7 @@ from tomopose.errors import InputError, NotConvergedError
 from tomopose.geometry.scanner import Scanner
 from tomopose.manipulator.error_models import PoseScatter, RigidErrors
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.manipulator.real_poses import Repeatability
 from tomopose.observations import BallObservations
 from tomopose.provenance import provenance
 from tomopose.units import Array
@@ -69,6 +75,7 @@ def _rigid(
     diagnosis: Diagnosis | None,
     arrangement: Arrangement,
     arguments: Mapping[str, Any],
+    taken: Taken,
 ) -> Calibration:
     p, fit, free = solution.used, solution.fit, solution.free
     assumed = assumed_names(free)
@@ -82,6 +89,7 @@ def _rigid(
             gain=solution.noise.gain,
             chi2_dof_with=solution.chi2 / solution.dof,
             chi2_dof_without=chi2 / solution.dof,
+            found=solution.noise.found,
         )
     linear = linear_fit(p, free, fit)
     scanners = adjusted_scanners(p.scanners, free, fit.delta)
@@ -123,9 +131,47 @@ def _rigid(
             magnification_at_ball=magnification_at_balls(
                 replace(p, t_MH=scale * p.t_MH), scanners, fit.T_HT, fit.t[p.ball]
             ),
+            assumed=taken.assumed,
+            contradicted=taken.contradicted,
+            tests=_tests(solution, chi2),
+            unseen=_unseen(solution, linear, moving_scanner=arrangement == "moving-scanner"),
             provenance=provenance(arguments=arguments),
         )
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Taken:
+    """assumed: of the scanner;  contradicted: values whose prior the images contradict, which were freed."""
+
+    assumed: tuple[Assumed, ...]
+    contradicted: tuple[Contradicted, ...] = ()
+
+
+def _tests(solution: Solution, stated_chi2: float) -> ScannerTests | None:
+    """One effect after the other, on all rows but those that chance may have spoilt; None where nothing fits."""
+    if not solution.fit.converged or stated_chi2 > NOTHING_FITS * 2 * len(solution.used):
+        return None
+    rows = np.flatnonzero(rows_to_test(solution.robust.keep))
+    problem = solution.problem.select(rows)
+    if 2 * len(problem) < solution.J.shape[2] + FEWEST_TESTED:
+        return None
+    return scanner_tests(problem, solution.free, solution.fit)
+
+
+FEWEST_TESTED = 10
+"""Equations beyond the unknowns that the tests need."""
+
+
+def _unseen(solution: Solution, linear: LinearFit, *, moving_scanner: bool) -> Unseen | None:
+    """What no ball shows of table and manipulator, and how the estimate answers to it."""
+    p, fit = solution.used, solution.fit
+    names = () if moving_scanner else unseen_names(p.R_MH, table=True)
+    if not names:
+        return None
+    b = blocks(p, solution.free, fit)
+    C = unseen_columns(names, b, T_HT=fit.T_HT, origin=p.t_MH, alpha=p.alpha)
+    return unseen_gain(names, inverse_information(fit.N), linear.J, linear.C, C)
 
 
 def calibrate(
@@ -135,12 +181,13 @@ def calibrate(
     *,
     manipulator: Any = None,
     model: str = "auto",
-    free: Sequence[str] = (),
+    free: str | Sequence[str] = "auto",
     fix: Sequence[str] = (),
     priors: Mapping[str, float] | None = None,
     robust: bool = True,
     hypotheses: bool | Sequence[Alternative] = True,
     pose_noise: Any = "auto",
+    repeatability: Repeatability | None = None,
     distances: Mapping[tuple[int, int], tuple[float, float]] | None = None,
     raise_on_failure: bool = True,
 ) -> Calibration:
@@ -148,20 +195,24 @@ def calibrate(
 
     Parameters
     ----------
-    scanner:      intrinsic geometry; parameters with a prior standard deviation (`scanner.sigma`) are freed with it.
+    scanner:      intrinsic geometry; values with a prior standard deviation (`scanner.sigma`) are estimated with it, 0
+                  is exact, and those without any get a documented default (`model.assumed`).
     poses:        the manipulator's poses with table angles and ball ids.
     observations: projected ball centres (px) with covariance, paired with the poses by pose_id.
                   Sequences of the three solve several runs (magnifications) of one mount together.
     manipulator:  a nominal hexapod or robot, needed for model "kinematic".
     model:        "rigid" trusts the poses; "kinematic" and "slack" identify the manipulator's errors too; "auto" is
                   "rigid" without a manipulator, and otherwise what predicts held-out poses best.
-    free, fix:    names of scanner parameters to estimate or to hold; see `parameters.UNITS`.
+    free:         "auto": a scanner value whose stated or assumed standard deviation the images contradict is freed,
+                  and the first line says so; "none": none is; or names to estimate without a prior.
+    fix:          names of scanner values to hold: exact; see `parameters.UNITS`.
     priors:       name -> prior standard deviation (mm, px, rad), in place of the scanner's.
     robust:       set aside centres that do not belong, and list them.
     hypotheses:   try the cheap alternative conventions (or those given) and say so in the verdict; all of them
                   where neither these nor the declared one fit.
-    pose_noise:   scatter of the manipulator about the poses it reports: "auto" estimates it where the residuals are
-                  significantly above what the centres' covariances explain; (mm, rad) states it; None has none.
+    pose_noise:   scatter of the manipulator about the poses it reports: "auto" estimates it as the root mean of
+                  its posterior, never tested to zero; (mm, rad) states it; None has none.
+    repeatability: the maker's, prior of the scatter; default: the manipulator's file's, or the paper's hexapod's.
     distances:    (ball id, ball id) -> (distance, standard uncertainty), mm: scale bars.  With them the balls are
                   solved for by the estimator of the manipulator's errors, so model must not be "rigid".
     raise_on_failure: raise where no optimum was reached; otherwise the status says so.
@@ -178,11 +229,14 @@ def calibrate(
         raise InputError("model 'kinematic' needs the manipulator's nominal geometry (--manipulator FILE)")
     if distances and (model == "rigid" or (model == "auto" and manipulator is None)):
         raise InputError("distances between balls serve models with the manipulator's errors; give its geometry")
+    free, auto = freed_names(free)
     rigid, freed = rigid_calibration(
         scanner,
         poses,
         observations,
         free=free,
+        auto=auto,
+        maker=maker_of(manipulator, repeatability),
         fix=fix,
         priors=priors,
         robust=robust,
@@ -200,7 +254,7 @@ def calibrate(
         return rigid
     from tomopose.calibration.identified.calibrate import calibrate_kinematic
 
-    return calibrate_kinematic(
+    found = calibrate_kinematic(
         scanner,
         poses,
         observations,
@@ -211,6 +265,28 @@ def calibrate(
         distances=distances,
         robust=robust,
     )
+    return replace(found, assumed=rigid.assumed, contradicted=rigid.contradicted)
+
+
+def freed_names(free: str | Sequence[str]) -> tuple[tuple[str, ...], bool]:
+    """(names to free, whether values that the images contradict are freed too) of "auto", "none" or names."""
+    if isinstance(free, str):
+        if free not in ("auto", "none"):
+            raise InputError(
+                f"free is {free!r}; 'auto', 'none' or names such as ('d_SR', 'u_0') are needed, a single text is not"
+            )
+        return (), free == "auto"
+    return tuple(free), not free
+
+
+def maker_of(manipulator: Any, stated: Repeatability | None) -> Repeatability | None:
+    """The maker's repeatability: as stated, else as the manipulator's file says; None: not known."""
+    if stated is not None or manipulator is None:
+        return stated
+    from tomopose.calibration.identified.calibrate import machine_of
+
+    machine = machine_of(manipulator)
+    return None if machine is None else machine.repeatability
 
 
 def rigid_calibration(
@@ -221,6 +297,8 @@ def rigid_calibration(
     free: Sequence[str] = (),
     fix: Sequence[str] = (),
     priors: Mapping[str, float] | None = None,
+    auto: bool = True,
+    maker: Repeatability | None = None,
     robust: bool = True,
     hypotheses: bool | Sequence[Alternative] = True,
     pose_noise: str | tuple[float, float] | None = "auto",
@@ -228,11 +306,21 @@ def rigid_calibration(
     arrangement: Arrangement = "moving-object",
 ) -> tuple[Calibration, FreeParameters]:
     """The calibration that trusts the poses, and what was freed; arguments as of `calibrate`."""
-    problem = pair(scanner, poses, observations)
-    require_on_panel(problem)
+    plain = pair(scanner, poses, observations)
+    require_on_panel(plain)
+    no_effect = without_effect(plain.alpha, moving_scanner=arrangement == "moving-scanner")
+    assumed = tuple(
+        assumed_for(s, free=free, fix=fix, priors=dict(priors or {}), no_effect=no_effect) for s in plain.scanners
+    )
+    problem = replace(plain, scanners=tuple(with_assumed(s, a) for s, a in zip(plain.scanners, assumed, strict=True)))
     freed = free_parameters(problem.scanners, free=free, fix=fix, priors=priors)
     stated = solve(problem, freed, robust=robust)
-    solution = with_pose_noise(stated, pose_noise, robust=robust)
+    against: tuple[Contradicted, ...] = ()
+    if auto:
+        freed, against = contradicted(stated.used, freed, stated.fit)
+        if against:
+            stated = solve(problem, freed, robust=robust, start=stated.fit)
+    solution = with_pose_noise(stated, pose_noise, robust=robust, maker=maker)
     diagnosis = None
     if hypotheses:
         other = set_pose_alternative(problem, poses)
@@ -247,7 +335,9 @@ def rigid_calibration(
         "robust": robust,
         "pose_noise": pose_noise if pose_noise is None or isinstance(pose_noise, str) else list(pose_noise),
     }
-    found = _rigid(solution, stated, diagnosis, arrangement, arguments)
+    taken = Taken(assumed=assumed[0], contradicted=against)
+    found = _rigid(solution, stated, diagnosis, arrangement, arguments, taken)
+    found = replace(found, scanner=replace(found.scanner, sigma=plain.scanner.sigma))
     if not found.converged and raise_on_failure:
         raise NotConvergedError(found.status, calibration=found)
     return found, freed

@@ -14,6 +14,7 @@ from tomopose.cli.options import ObservedOptions, SpokenOptions, WritingOptions,
 
 if TYPE_CHECKING:
     from tomopose import BallObservations, Calibration, PoseSequence, Scanner, TwinRobots
+    from tomopose.manipulator.real_poses import Repeatability
     from tomopose.manipulator.twin_file import TwinDrawing
 
 EPILOG = (
@@ -53,11 +54,23 @@ class CalibrationOptions(ObservedOptions, SpokenOptions):
     model: Annotated[
         str, typer.Option("--model", help="auto, rigid, kinematic or slack: how the manipulator may err.")
     ] = "auto"
-    free: Annotated[str | None, typer.Option("--free", help="Scanner parameters to estimate too, e.g. d_SR,u_0.")] = (
-        None
-    )
+    free: Annotated[
+        str,
+        typer.Option(
+            "--free",
+            help="Scanner values to estimate without a prior, e.g. d_SR,u_0; auto: those whose stated or assumed sigma "
+            "the images contradict; none: none.",
+        ),
+    ] = "auto"
     fix: Annotated[
         str | None, typer.Option("--fix", help="Parameters to hold although scanner.json gives them a sigma.")
+    ] = None
+    repeatability: Annotated[
+        str | None,
+        typer.Option(
+            "--repeatability-um-urad",
+            help="The maker's repeatability of the manipulator, 1 sigma, as 0.5,12: prior of its scatter.",
+        ),
     ] = None
     distance: Annotated[
         list[str] | None,
@@ -180,14 +193,28 @@ def twin_robots(o: CalibrationOptions, given: Inputs) -> TwinRobots:
     return given.twin.robots(tp.read_poses(o.source_poses, forward=forward_of(given.twin.source)))
 
 
+def repeatability_of(text: str | None) -> Repeatability | None:
+    """`0.5,12` (um, urad) as a Repeatability."""
+    from tomopose.manipulator.real_poses import Repeatability
+
+    if text is None:
+        return None
+    try:
+        t_um, w_urad = (float(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not UM,URAD", param_hint="--repeatability-um-urad") from None
+    return Repeatability(t_mm=t_um * 1e-3, w_rad=w_urad * 1e-6)
+
+
 def solve(o: Options, given: Inputs) -> Calibration:
     """The calibration of the arrangement; where no optimum was reached, what was reached (it is rejected)."""
     import tomopose as tp
     from tomopose.errors import NotConvergedError
 
     scanner, poses, observations = given.scanner, given.poses, given.observations
+    free = o.free if o.free in ("auto", "none") else names(o.free)
     settings: dict[str, Any] = {
-        "model": o.model, "free": names(o.free), "fix": names(o.fix), "distances": scale_bars(o.distance),
+        "model": o.model, "free": free, "fix": names(o.fix), "distances": scale_bars(o.distance),
     }  # fmt: skip
     try:
         if given.twin is not None:
@@ -197,7 +224,14 @@ def solve(o: Options, given: Inputs) -> Calibration:
             return tp.calibrate_inverse(
                 scanner, poses, observations, manipulator=given.manipulator, d_SD_sigma=o.distance_sigma, **settings
             )
-        return tp.calibrate(scanner, poses, observations, manipulator=given.manipulator, **settings)
+        return tp.calibrate(
+            scanner,
+            poses,
+            observations,
+            manipulator=given.manipulator,
+            repeatability=repeatability_of(o.repeatability),
+            **settings,
+        )
     except NotConvergedError as error:
         if not isinstance(error.calibration, tp.Calibration):
             raise

@@ -176,17 +176,38 @@ def calibration_summary(calibration: Calibration) -> tuple[dict[str, Any], list[
         "poses_used": len(calibration.pose_id),
         "outliers": dict(calibration.outliers),
         "model": calibration.model,
+        "findings": [
+            {"rule": f.rule, "words": f.words, "cure": f.remedy, "verdict": f.verdict} for f in calibration.checks
+        ],
+        "explanations": [e.words for e in calibration.explanations],
+        "assumed": [{"name": a.name, "sigma": a.sigma, "unit": a.unit, "from": a.source} for a in calibration.assumed],
+        "scan_px": None if calibration.budget is None else calibration.budget.total,
         "parameters": [{"name": p.name, "value": p.value, "u": p.u, "unit": p.unit} for p in calibration.parameters],
     }
     lines = [
-        f"{calibration.verdict}: {calibration.status}",
+        f"{calibration.verdict}: {calibration.status}{first_explanation(calibration)}",
         *(f"  - {reason}" for reason in calibration.reasons),
+        *(f"  {words}" for words in notes(calibration)),
         f"  d_rms {calibration.d_rms:.4g} px ({calibration.d_rms_um:.3g} um at the object), "
         f"{len(calibration.pose_id)} poses, {len(calibration.outliers)} set aside",
         *(f"  {p.name:<10} {value_with_uncertainty(p.value, p.u, p.unit)}" for p in shown),
         *([f"  and {more} of the manipulator's own errors (--json and the report list them)"] if more else []),
     ]
     return summary, lines
+
+
+def first_explanation(calibration: Calibration) -> str:
+    """What explains best why the scanner's values as declared do not fit, for the first line; "" where they do."""
+    explained = calibration.explanations
+    return f"; {explained[0].words}" if explained else ""
+
+
+def notes(calibration: Calibration) -> list[str]:
+    """Findings worth knowing that give no doubt, and what the uncertainty of a scan is made of."""
+    from tomopose.calibration.model.budget import budget_words
+
+    lines = [f"note: {f.words}" for f in calibration.checks if f.verdict == "trustworthy"]
+    return lines if calibration.budget is None else [budget_words(calibration.budget, calibration.assumed), *lines]
 
 
 def exit_code(calibration: Calibration) -> int:

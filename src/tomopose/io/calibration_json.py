@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.result import Assumed, Calibration, Observability, Parameter
+from tomopose.calibration.result import Calibration, Observability, Parameter
 from tomopose.coverage import expanded_k2
 from tomopose.errors import FileError, InputError
 from tomopose.files import read_json, require_absent, warn_if_edited, write_json
@@ -19,7 +19,7 @@ from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import rotation_angle_between, rotation_from_angles
 from tomopose.geometry.scanner import PARAMETER_UNITS
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.io.calibration import checks_blocks
+from tomopose.io.calibration import assumptions, checks_blocks
 from tomopose.io.calibration.errors_block import errors_document, errors_from_document
 from tomopose.io.calibration.version_1 import as_version_2
 from tomopose.io.numbers_json import decode_array, encode
@@ -62,7 +62,7 @@ def calibration_document(cal: Calibration) -> dict[str, Any]:
             for p in cal.parameters
         ],
         "priors": {name: encode(sigma) for name, sigma in cal.priors.items()},
-        "assumed": [{"name": a.name, "sigma": encode(a.sigma), "unit": a.unit, "from": a.source} for a in cal.assumed],
+        **assumptions.document(cal),
         "covariance": {"names": cal.tangent, "units": tangent_units(cal), "matrix": encode(cal.covariance)},
         "d_rms_px": cal.d_rms if len(cal.pose_id) else None,
         "d_rms_um": cal.d_rms_um if len(cal.pose_id) else None,
@@ -187,10 +187,7 @@ def _calibration(document: Mapping[str, Any], where: str) -> Calibration:
         arrangement=document["arrangement"],
         errors=errors_from_document(document["manipulator"], inverse=document["arrangement"] != "moving-object"),
         priors={name: _number(sigma) for name, sigma in document["priors"].items()},
-        assumed=tuple(
-            Assumed(name=a["name"], sigma=_number(a["sigma"]), unit=a["unit"], source=a["from"])
-            for a in document["assumed"]
-        ),
+        **assumptions.from_document(document, m),
         converged=bool(document["converged"]),
         status=document["status"],
         checks=tuple(checks_blocks.finding_from(f) for f in document["findings"]),

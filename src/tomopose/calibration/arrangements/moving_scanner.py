@@ -12,7 +12,7 @@ from tomopose.calibration.checks.conventions import ALTERNATIVES_OF_MOVING_SCANN
 from tomopose.calibration.identified.calibrate import calibrate_kinematic, machine_of
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.result import Calibration, ViewDistances
-from tomopose.calibration.solve import rigid_calibration
+from tomopose.calibration.solve import freed_names, rigid_calibration
 from tomopose.errors import InputError, NotConvergedError, NotObservableError
 from tomopose.geometry.scanner import Scanner
 from tomopose.manipulator.error_models import corrected_poses
@@ -31,7 +31,7 @@ def calibrate_inverse(
     model: str = "auto",
     d_SD_sigma: float = 0.0,
     distances: Mapping[tuple[int, int], tuple[float, float]] | None = None,
-    free: Sequence[str] = (),
+    free: str | Sequence[str] = "auto",
     fix: Sequence[str] = (),
     priors: Mapping[str, float] | None = None,
     robust: bool = True,
@@ -62,6 +62,7 @@ def calibrate_inverse(
         raise InputError(f"d_SD_sigma is {d_SD_sigma}; a standard deviation >= 0 in mm is needed")
     if d_SD_sigma and model == "slack":
         raise InputError("a d_SD that differs from view to view cannot be told from poses that scatter (model slack)")
+    free, auto = freed_names(free)
     for name in free:
         if name == "d_SR" or name.startswith("axis"):
             raise NotObservableError(
@@ -81,6 +82,8 @@ def calibrate_inverse(
             hypotheses=ALTERNATIVES_OF_MOVING_SCANNER,
             arrangement="moving-scanner",
             free=free,
+            auto=auto,
+            maker=None if machine is None else machine.repeatability,
             fix=fix,
             priors=priors,
             robust=robust,
@@ -91,6 +94,7 @@ def calibrate_inverse(
         raise
     if found.verdict == "rejected":
         return found
+    assumed = found.assumed
     if machine is not None or d_SD_sigma or model not in ("auto", "rigid"):
         found = calibrate_kinematic(
             scanner,
@@ -104,6 +108,7 @@ def calibrate_inverse(
             inverse=True,
             view_sigma={"d_SD": d_SD_sigma} if d_SD_sigma else None,
         )
+        found = replace(found, assumed=assumed)
     if not d_SD_sigma:
         return found
     seen = observations.select(np.isin(observations.pose_id, found.pose_id))

@@ -14,17 +14,19 @@ from tomopose.calibration.identified.map_estimate import KinematicProblem, State
 from tomopose.calibration.identified.model_selection import better, judged
 from tomopose.calibration.identified.result import calibration_of
 from tomopose.calibration.identified.scale_bars import require_balls_not_swapped
+from tomopose.calibration.model.assumed import assumed_for, with_assumed
 from tomopose.calibration.model.parameters import MATTERS, UNITS, FreeParameters, free_parameters, unit_of
 from tomopose.calibration.model.problem import pair
 from tomopose.calibration.model.twin_projection import balls_from_rays, twin_view_matrices
 from tomopose.calibration.projection_matrices import require_same_scanner
 from tomopose.calibration.result import Calibration
+from tomopose.calibration.solve import freed_names
 from tomopose.calibration.uncertainty.propagation import field_of_view_points
 from tomopose.errors import InputError, NotObservableError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.geometry.rotations import skew
-from tomopose.geometry.scanner import Scanner
+from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.error_models import TwinErrors, outside_notes
 from tomopose.manipulator.inverse import inverse_poses
@@ -71,7 +73,7 @@ def calibrate_twin(
     mount: RigidTransform,
     balls: Mapping[int, Any] | None = None,
     model: str = "auto",
-    free: Sequence[str] = (),
+    free: str | Sequence[str] = "auto",
     fix: Sequence[str] = (),
     priors: Mapping[str, float] | None = None,
     distances: Mapping[tuple[int, int], tuple[float, float]] | None = None,
@@ -98,7 +100,10 @@ def calibrate_twin(
         raise InputError(f"unknown model {model!r}; known are {', '.join(MODELS)}")
     if np.asarray(poses.alpha).any():
         raise InputError("the arrangement with a standing object has no rotary table; alpha must be 0 in every pose")
-    freed = panel_parameters(scanner, free=free, fix=fix, priors=priors)
+    free, _ = freed_names(free)
+    others = [name for name in PARAMETER_UNITS if name not in PANEL]
+    assumed = assumed_for(scanner, free=free, fix=fix, priors=dict(priors or {}), no_effect=others)
+    freed = panel_parameters(with_assumed(scanner, assumed), free=free, fix=fix, priors=priors)
     turned = inverse_poses(poses)
     data = pair(scanner, turned, observations)
     _require_both_tables(data.pose_id, twin.source_poses)

@@ -28,13 +28,14 @@ Words = Callable[[Array, float, str], str]
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """name: fixed;  kind: scanner | panel | manipulator | table | time | step;  short: a few words;
-    words: (size, px, pose id) -> the sentence."""
+    """name: fixed;  kind: scanner | panel | manipulator | table | time | step;  short: a few words;  odds: log of its
+    prior odds against the others;  words: (size, px, pose id) -> the sentence."""
 
     name: str
     kind: str
     short: str
     words: Words
+    odds: float = 0.0
 
     def words_of(self, size: Array, px: float, at: str, *, short: bool = False) -> str:
         return self.short if short else f"{self.words(size, px, at)} ({px:.2g} px rms)"
@@ -82,10 +83,20 @@ SCANNER_WORDS = {
 }
 
 
+AXIS_ODDS = -1.0
+"""A tilt of the table axis about the beam and a roll of the panel are the same to the images: the panel's is named."""
+
+
 def scanner_effect(name: str) -> Effect:
     text, factor, short = SCANNER_WORDS[name]
     kind = "manipulator" if name == "translation_scale" else "scanner"
-    return Effect(name=name, kind=kind, short=short, words=lambda size, px, at: text.format(float(size[0]) * factor))
+    return Effect(
+        name=name,
+        kind=kind,
+        short=short,
+        words=lambda size, px, at: text.format(float(size[0]) * factor),
+        odds=AXIS_ODDS if name.startswith("axis") else 0.0,
+    )
 
 
 def _fixed(name: str, kind: str, short: str, text: str | None = None) -> Effect:
@@ -272,11 +283,16 @@ def _drifts(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
     return found
 
 
-def _step_effect(name: str, short: str, text: str, part: slice, factor: float, unit: str) -> Effect:
+IMAGE_STEP_ODDS = -8.0
+"""A bump or a slip is likelier than a jump of spot or detector, which has fewer parameters and would else win wherever
+few poses come after the step."""
+
+
+def _step_effect(name: str, short: str, text: str, part: slice, factor: float, unit: str, odds: float = 0.0) -> Effect:
     def words(size: Array, px: float, at: str) -> str:
         return f"{text} at pose {at}, by {np.linalg.norm(size[part]) * factor:.2g} {unit}"
 
-    return Effect(name=name, kind="step", short=short, words=words)
+    return Effect(name=name, kind="step", short=short, words=words, odds=odds)
 
 
 def steps_of(problem: Problem, b: ProjectionBlocks) -> list[Steps]:
@@ -305,7 +321,13 @@ def steps_of(problem: Problem, b: ProjectionBlocks) -> list[Steps]:
         ),
         Steps(
             effect=_step_effect(
-                "image step", "the images jumped", "the images jumped (focal spot or detector)", slice(0, 2), 1.0, "px"
+                "image step",
+                "the images jumped",
+                "the images jumped (focal spot or detector)",
+                slice(0, 2),
+                1.0,
+                "px",
+                IMAGE_STEP_ODDS,
             ),
             C=np.array(np.broadcast_to(problem.W @ np.eye(2), (n, 2, 2))),
             least=2,

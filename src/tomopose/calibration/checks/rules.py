@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tomopose.calibration.checks.convention_tests import BETTER, MUCH_BETTER
-from tomopose.calibration.checks.evidence import measures
+from tomopose.calibration.checks.evidence import culprits, measures
 from tomopose.calibration.checks.evidence.evidence import MISFIT_CHI2, Evidence
 from tomopose.calibration.checks.evidence.measures import (
     BALL_SIZE,
@@ -22,13 +22,16 @@ from tomopose.calibration.checks.evidence.measures import (
     REPEAT_PX,
     Found,
 )
+from tomopose.calibration.checks.scanner_tests import DECISIVE
 from tomopose.calibration.checks.stability import SIGNIFICANT
 from tomopose.calibration.checks.verdict import Finding, Verdict
 from tomopose.calibration.model.covariance import WIDENING_PROBABILITY
+from tomopose.calibration.rigid.contradiction import CONTRADICTED
 from tomopose.calibration.rigid.outliers import LARGEST_SHARE
 
 MODELS = ("rigid", "kinematic", "slack")
 ARRANGEMENTS = ("moving-object", "moving-scanner", "twin")
+ONE_TABLE = ("moving-object", "moving-scanner")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,6 +221,49 @@ RULES: tuple[Rule, ...] = (
         verdict="doubtful",
         reason="as for drift, over all poses at which it may have happened",
         measure=lambda e, limit: measures.effects(e, limit, True),
+    ),
+    Rule(
+        name="changed during the run",
+        condition="a drift, or a step of ball, mount or images, with an evidence above {limit:g} beside everything "
+        "assumed",
+        limit=DECISIVE,
+        verdict="doubtful",
+        reason="odds of 3000 to 1 after all looks; benchmarks/reality",
+        measure=lambda e, limit: culprits.culprits(e, limit, ("time", "step")),
+        models=("rigid",),
+        arrangements=ONE_TABLE,
+    ),
+    Rule(
+        name="scanner or manipulator not as modelled",
+        condition="distortion or tiles of the panel, scales or axes of the manipulator, errors of the table or a "
+        "scanner value, with an evidence above {limit:g} beside everything assumed",
+        limit=DECISIVE,
+        verdict="doubtful",
+        reason="odds of 3000 to 1 after all looks; benchmarks/reality",
+        measure=lambda e, limit: culprits.culprits(e, limit, ("panel", "manipulator", "table", "scanner")),
+        models=("rigid",),
+        arrangements=ONE_TABLE,
+    ),
+    Rule(
+        name="value freed",
+        condition="a scanner value lies more than {limit:g} of its stated or assumed sigmas away, and was freed",
+        limit=CONTRADICTED,
+        verdict="trustworthy",
+        reason="the images determine it: the result rests on them, not on the value that was stated",
+        measure=culprits.contradicted,
+        models=("rigid",),
+        arrangements=ONE_TABLE,
+    ),
+    Rule(
+        name="two explanations",
+        condition="a cause other than a scanner value explains the images as well as the scanner values do, which "
+        "would have to lie beyond 3 assumed sigmas",
+        limit=NONE,
+        verdict="doubtful",
+        reason="the two make different scans of the same images",
+        measure=culprits.either_or,
+        models=("rigid",),
+        arrangements=ONE_TABLE,
     ),
     Rule(
         name="repeated pose",

@@ -16,8 +16,9 @@ leaves more than the stated sigmas explain; the second holds where the stated si
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +34,9 @@ thousand, and an effect of 5 sigma in one coordinate, with 189 poses and 40 look
 
 EQUAL = 3.0
 """Explanations within this evidence of the best are named beside it."""
+
+PLAUSIBLE = 3.0
+"""Assumed standard deviations within which a scanner value is the likelier of two equal explanations."""
 
 MOST, LISTED = 4, 3
 """Explanations that are taken one after the other; single ones that are listed."""
@@ -119,6 +123,7 @@ class _Candidate:
     gain: float
     evidence: float
     at: int = -1
+    size: float = float("nan")
 
 
 def _plain(columns: Sequence[Columns], Q: Array, rest: Array, dof: int, looks: float, n: int) -> list[_Candidate]:
@@ -140,8 +145,10 @@ def _plain(columns: Sequence[Columns], Q: Array, rest: Array, dof: int, looks: f
         gain, rank = _gain(M[part, part], g[part])
         if not rank:
             continue
-        evidence = float(_evidence(np.array(gain), rank, chi2, dof, n, looks))
-        found.append(_Candidate(effect=c.effect, columns=c.C, gain=gain, evidence=evidence))
+        evidence = float(_evidence(np.array(gain), rank, chi2, dof, n, looks)) + c.effect.odds
+        one = c.C.shape[1] == 1
+        size = float(g[part][0] / M[part, part][0, 0] * unit[part][0]) if one else float("nan")
+        found.append(_Candidate(effect=c.effect, columns=c.C, gain=gain, evidence=evidence, size=size))
     return found
 
 
@@ -182,17 +189,34 @@ def _step(steps: Steps, Q: Array, rest: Array, dof: int, looks: float, n: int) -
     )
     late = C * (np.arange(n) >= k)[:, None, None]
     return _Candidate(
-        effect=steps.effect, columns=late.reshape(2 * n, c), gain=float(gain[best]), evidence=evidence, at=k
+        effect=steps.effect,
+        columns=late.reshape(2 * n, c),
+        gain=float(gain[best]),
+        evidence=evidence + steps.effect.odds,
+        at=k,
     )
 
 
 @dataclass(frozen=True, kw_only=True)
+class Single:
+    """An effect on its own, before any was taken: its evidence, and its size where it has one coordinate."""
+
+    name: str
+    short: str
+    kind: str
+    evidence: float
+    size: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Ranked:
-    """chosen: explanations in the order in which they were taken, decisive ones only;  first: all single ones, best
-    first;  chi2, left: before and after the chosen ones;  dof."""
+    """single: every effect on its own, likeliest first;  chosen: explanations in the order in which they were taken,
+    decisive ones only;  first: the likeliest single ones, explained;  chi2, left: before and after the chosen ones;
+    dof."""
 
     chosen: tuple[Explanation, ...]
     first: tuple[Explanation, ...]
+    single: tuple[Single, ...]
     chi2: float
     left: float
     dof: int
@@ -213,6 +237,7 @@ def ranked_explanations(
     chosen: list[Explanation] = []
     taken: list[Array] = []
     first: tuple[Explanation, ...] = ()
+    single: tuple[Single, ...] = ()
     total = left = 0.0
     dof = 0
     for turn in range(most + 1):
@@ -228,6 +253,10 @@ def ranked_explanations(
         candidates += [s for s in (_step(one, Q, rest, dof, looks, n) for one in steps) if s is not None]
         candidates.sort(key=lambda c: -c.evidence)
         if turn == 0:
+            single = tuple(
+                Single(name=c.effect.name, short=c.effect.short, kind=c.effect.kind, evidence=c.evidence, size=c.size)
+                for c in candidates
+            )
             first = tuple(_explain(c, candidates, problem, white, Q, rest, left) for c in candidates[:LISTED])
         if not candidates or candidates[0].evidence < DECISIVE:
             break
@@ -238,7 +267,9 @@ def ranked_explanations(
         more[: 2 * n] = best.columns
         taken.append(best.columns)
         A = np.concatenate([A, more], axis=1)
-    return Ranked(chosen=tuple(chosen), first=first, chi2=total, left=left, dof=dof, columns=tuple(taken))
+    return Ranked(
+        chosen=tuple(chosen), first=first, single=single, chi2=total, left=left, dof=dof, columns=tuple(taken)
+    )
 
 
 def _explain(
@@ -305,6 +336,45 @@ class ScannerTests:
     beside: Ranked
     declared: Ranked
     gain: float
+    sigma: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def rivals(self) -> tuple[Single, ...]:
+        """Effects that are no scanner value and explain why the declared values do not fit as well as all scanner
+        values do together; none where a scanner value that explains as much lies within what was assumed of it,
+        or where something is left beside all of them, which is named itself."""
+        best = self.declared.single[0].evidence if self.declared.single else 0.0
+        if best < DECISIVE or self.left:
+            return ()
+        equal = [s for s in self.declared.single if s.evidence > best - EQUAL]
+        likely = [s for s in equal if abs(s.size) <= PLAUSIBLE * self.sigma.get(s.name, 0.0)]
+        others = [s for s in equal if s.kind != "scanner" and s.evidence > self.gain - EQUAL]
+        return () if likely else tuple(others)
+
+    @property
+    def left(self) -> tuple[Explanation, ...]:
+        """What nothing that was assumed explains: grounds for doubt."""
+        return self.beside.chosen
+
+    @property
+    def explanations(self) -> tuple[Explanation, ...]:
+        """The culprit first: what explains best why the declared values do not fit, then what is left."""
+        first = self.declared.chosen[:1]
+        return (*first, *(e for e in self.beside.chosen if e.name not in {f.name for f in first}))
+
+
+ISOLATED = 2
+"""Centres set aside one or two at a time are chance; more neighbours are not, and the tests look at them."""
+
+
+def rows_to_test(keep: Any) -> Any:
+    """(n,) bool: the rows used, and those set aside three or more in a row, which no chance explains."""
+    keep = np.asarray(keep, dtype=bool)
+    rows = keep.copy()
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], keep, [True]]).astype(int)))
+    for a, b in zip(edges[::2], edges[1::2], strict=True):
+        rows[a:b] |= b - a > ISOLATED
+    return rows
 
 
 def scanner_tests(problem: Problem, free: FreeParameters, fit: Fit) -> ScannerTests:
@@ -335,8 +405,11 @@ def scanner_tests(problem: Problem, free: FreeParameters, fit: Fit) -> ScannerTe
         return ScannerTests(beside=beside, declared=beside, gain=0.0)
     before = whitened(problem, held, plain)
     declared = ranked_explanations(problem, before, [*effects_of(problem, blocks(problem, held, plain))], steps, most=1)
-    together = (declared.chi2 - beside.chi2) / 2 - _occam(before, free, problem, b)
-    return ScannerTests(beside=beside, declared=declared, gain=together)
+    left = max(beside.chi2, 1e-300)
+    fits = min((declared.chi2 - left) / 2, declared.dof / 2 * float(np.log(max(declared.chi2, 1e-300) / left)))
+    together = fits - _occam(before, free, problem, b)
+    # as assumed, not as widened where the images contradict it
+    return ScannerTests(beside=beside, declared=declared, gain=together, sigma=problem.scanner.sigma)
 
 
 def _occam(before: Whitened, free: FreeParameters, problem: Problem, b: object) -> float:

@@ -12,9 +12,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
+from tomopose.units import Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +35,7 @@ _AXIS = "the axis defines W; what is left of its alignment after a search for th
 DEFAULTS: Mapping[str, Default] = MappingProxyType(
     {
         "d_SD": Default(sigma=0.5, source=_DISTANCES),
-        "d_SR": Default(sigma=0.2, source=f"{_DISTANCES}; a magnification axis after its reference run"),
+        "d_SR": Default(sigma=0.15, source=f"{_DISTANCES}; a magnification axis after its reference run"),
         "p_u": Default(sigma=1e-4, relative=True, source=_PITCH),
         "p_v": Default(sigma=1e-4, relative=True, source=_PITCH),
         "u_0": Default(sigma=0.5, source=_HALF_PIXEL),
@@ -49,29 +50,33 @@ DEFAULTS: Mapping[str, Default] = MappingProxyType(
 )
 """Name -> default of a scanner's value, in the value's own unit."""
 
-ROTATION_SCALE = 5e-5
+ROTATION_SCALE = 2e-5
 """Scale error of a platform's rotations: that of linear encoders with the geometry of the joints."""
 
-WOBBLE_MM, WOBBLE_RAD = 1e-4, 0.5e-6
+TRANSLATION_SCALE = 5e-6
+"""Scale error of the translations, 5 um a metre: a glass scale of good grade.  No image shows it: the translations are
+the only lengths that a calibration by one ball knows."""
+
+WOBBLE_MM, WOBBLE_RAD = 5e-5, 0.25e-6
 """Radial, axial and tilt error motion of a rotary table with an air bearing, first harmonic."""
 
-Origin = Literal["scanner.json", "default", "exact", "option", "hexapod.json", "robot.json"]
+Source: TypeAlias = Literal["scanner.json", "default", "exact", "option"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Assumed:
     """A value that enters the result with an uncertainty that was not measured here.
 
-    sigma: standard uncertainty in `unit`; origin: who said so.
+    value: as it was given;  sigma: standard uncertainty in `unit`.
+    source: "scanner.json" (the user's number), "default" (nobody stated any), "exact" (the user's 0, or `fix`),
+    "option" (priors).
     """
 
     name: str
+    value: float
     sigma: float
     unit: str
-    origin: Origin
-
-    def to_json(self) -> dict[str, str | float]:
-        return {"name": self.name, "sigma": self.sigma, "unit": self.unit, "from": self.origin}
+    source: Source
 
 
 def default_sigma(scanner: Scanner, name: str) -> float:
@@ -89,11 +94,43 @@ def assumed_of(scanner: Scanner, *, skip: Iterable[str] = ()) -> tuple[Assumed, 
             continue
         stated = scanner.sigma.get(name)
         sigma = default_sigma(scanner, name) if stated is None else stated
-        origin: Origin = "default" if stated is None else "exact" if stated == 0 else "scanner.json"
-        found.append(Assumed(name=name, sigma=sigma, unit=PARAMETER_UNITS[name], origin=origin))
+        source: Source = "default" if stated is None else "exact" if stated == 0 else "scanner.json"
+        found.append(
+            Assumed(name=name, value=getattr(scanner, name), sigma=sigma, unit=PARAMETER_UNITS[name], source=source)
+        )
     return tuple(found)
 
 
-def with_assumed(scanner: Scanner, *, skip: Iterable[str] = ()) -> Scanner:
-    """The scanner with a standard deviation for every value; values in `skip` keep what they have."""
-    return replace(scanner, sigma={**scanner.sigma, **{a.name: a.sigma for a in assumed_of(scanner, skip=skip)}})
+def with_assumed(scanner: Scanner, assumed: Iterable[Assumed]) -> Scanner:
+    """The scanner with the standard deviations that are assumed of it."""
+    return replace(scanner, sigma={**scanner.sigma, **{a.name: a.sigma for a in assumed}})
+
+
+def without_effect(alpha: Array, *, moving_scanner: bool) -> tuple[str, ...]:
+    """Scanner values on which nothing depends beside the mount, given the table angles (n,) of a run.
+
+    A scanner that moves as a whole takes a roll and a shift of the origin of W into its mount, and has no table.
+    """
+    return ("d_SR", "eta", "axis_y", "axis_tilt_x", "axis_tilt_y") if moving_scanner and not alpha.any() else ()
+
+
+def assumed_for(
+    scanner: Scanner,
+    *,
+    free: Iterable[str],
+    fix: Iterable[str],
+    priors: Mapping[str, float],
+    no_effect: Iterable[str] = (),
+) -> tuple[Assumed, ...]:
+    """What a calibration assumes, with the words of its options: `free` and `fix` names, `priors` (sigma by name)."""
+    free, fix = set(free), set(fix)
+    skip = {n for n in free if not scanner.sigma.get(n)} | set(no_effect)
+    skip |= {"p_u"} if "pitch_ratio" in free | set(priors) else set()
+    found = []
+    for a in assumed_of(scanner, skip=skip):
+        if a.name in fix:
+            a = replace(a, sigma=0.0, source="exact")
+        elif a.name in priors:
+            a = replace(a, sigma=float(priors[a.name]), source="option")
+        found.append(a)
+    return tuple(found)

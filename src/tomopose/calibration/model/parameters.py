@@ -100,8 +100,8 @@ def free_parameters(
 
     A parameter with a prior standard deviation (in scanner.sigma or `priors`, which wins) is freed with that prior,
     since its uncertainty is part of the result's; one in `free` is freed, with its prior where it has one; one in
-    `fix`, or with the standard deviation 0 (exact), is held.  Units: mm, px, rad; pitch_ratio and translation_scale are
-    pure numbers.  Defaults for values that nobody stated are not added here; see `assumed`.
+    `fix`, or with the standard deviation 0 (exact) and not in `free`, is held.  Units: mm, px, rad; pitch_ratio and
+    translation_scale are pure numbers.  Defaults for values that nobody stated are not added here; see `assumed`.
     """
     if isinstance(free, str) or isinstance(fix, str):
         raise InputError("free and fix are sequences of names, such as free=('d_SR', 'u_0'); a single text was given")
@@ -118,9 +118,6 @@ def free_parameters(
     both = [n for n in free if n in fix]
     if both:
         raise InputError(f"{both[0]} is named in free and in fix")
-    held = [n for n in free if sigma.get(n) == 0]
-    if held:
-        raise InputError(f"{held[0]} is to be freed, but its standard deviation is 0: it was declared exact")
     sigma = {name: s for name, s in sigma.items() if s > 0}
     chosen = [n for n in UNITS if n not in fix and (n in free or n in sigma)]
     if "pitch_ratio" in chosen and "p_u" in chosen:

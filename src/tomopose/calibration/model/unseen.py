@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tomopose.calibration.model.assumed import ROTATION_SCALE, WOBBLE_MM, WOBBLE_RAD
+from tomopose.calibration.model.assumed import ROTATION_SCALE, TRANSLATION_SCALE, WOBBLE_MM, WOBBLE_RAD
 from tomopose.calibration.model.ball_projection import ProjectionBlocks
 from tomopose.geometry.rotations import R_z, log_rotation, skew
 from tomopose.geometry.transforms import RigidTransform
@@ -29,7 +29,7 @@ WOBBLES = (
     *(f"table_{c}_{f}{k}" for k in HARMONICS for c in "xyz" for f in ("cos", "sin")),
     *(f"table_tilt_{c}_{f}{k}" for k in HARMONICS for c in "xy" for f in ("cos", "sin")),
 )
-NAMES = (*ROTATIONS, *WOBBLES)
+TRANSLATIONS = "scale_of_translations"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,15 +45,28 @@ def unseen_sigma(names: tuple[str, ...]) -> Array:
     """Prior standard deviations; the second harmonic of a wobble is half the first."""
     values = []
     for name in names:
-        size = ROTATION_SCALE if name in ROTATIONS else WOBBLE_RAD if name.startswith("table_tilt") else WOBBLE_MM
+        size = (
+            TRANSLATION_SCALE
+            if name == TRANSLATIONS
+            else ROTATION_SCALE
+            if name in ROTATIONS
+            else WOBBLE_RAD
+            if name.startswith("table_tilt")
+            else WOBBLE_MM
+        )
         values.append(size / (int(name[-1]) if name in WOBBLES else 1))
     return np.array(values)
+
+
+def unseen_unit(name: str) -> str:
+    """Unit of a direction that no ball shows."""
+    return "" if name in ROTATIONS or name == TRANSLATIONS else "rad" if name.startswith("table_tilt") else "mm"
 
 
 def unseen_names(R_MH: Array, *, table: bool) -> tuple[str, ...]:
     """Those that apply to a manipulator with poses R_MH (n, 3, 3), and to a set-up with or without a table."""
     turned = np.linalg.norm(log_rotation(R_MH[0].T @ R_MH), axis=1).max()
-    return (*(ROTATIONS if 0.0 < turned < PLATFORM_RAD else ()), *(WOBBLES if table else ()))
+    return (TRANSLATIONS, *(ROTATIONS if 0.0 < turned < PLATFORM_RAD else ()), *(WOBBLES if table else ()))
 
 
 def turns(R: Array) -> Array:
@@ -78,6 +91,9 @@ def unseen_columns(
     w = turns(b.R_MH)
     columns = []
     for name in names:
+        if name == TRANSLATIONS:
+            columns.append((b.G_H @ origin[:, :, None])[..., 0])
+            continue
         if name in ROTATIONS:
             i = "xyz".index(name[-1])
             columns.append(by_turn[:, :, i] * w[:, None, i])

@@ -14,7 +14,6 @@ from tomopose.calibration.rigid.fit import (
     Fit,
     blocks,
     jacobian,
-    linear_fit,
     minimise,
     residuals,
     tangent_names,
@@ -25,6 +24,7 @@ from tomopose.calibration.rigid.outliers import RobustFit, robust_fit
 from tomopose.calibration.rigid.pose_noise import PoseNoise, estimate_pose_noise, total_covariance
 from tomopose.calibration.rigid.start import closed_form, other_starts, ray_equations
 from tomopose.errors import InputError, NotConvergedError, NotObservableError, UnitError
+from tomopose.manipulator.real_poses import Repeatability
 from tomopose.units import Array
 
 LIKELY = 2.5
@@ -197,42 +197,53 @@ def solve(
 NOISE_ROUNDS = 3
 
 
-def with_pose_noise(solution: Solution, pose_noise: Any, *, robust: bool = True) -> Solution:
-    """The solution with the manipulator's scatter in the weights.
-
-    pose_noise: None (detection noise only), "auto" (variance components, where chi2 is significantly too large), or
-    the standard deviations (mm, rad) of a pose's translation and rotation, a coordinate each.
-    """
-    if pose_noise is None:
-        return solution
-    original = solution.problem
-    # what did not fit as a whole is not made to fit by setting its worst rows aside
-    robust = robust and not solution.robust.misfit
+def _given_noise(pose_noise: Any) -> PoseNoise | None:
+    """The scatter that was stated, or None where it is to be estimated."""
     if isinstance(pose_noise, str):
         if pose_noise != "auto":
             raise InputError(f"pose_noise is {pose_noise!r}; None, 'auto' or two numbers (mm, rad) are needed")
-        if not significant(solution.chi2, solution.dof):
-            return solution
-    elif np.shape(pose_noise) != (2,) or not np.isfinite(pose_noise).all() or np.min(pose_noise) < 0:
+        return None
+    if np.shape(pose_noise) != (2,) or not np.isfinite(pose_noise).all() or np.min(pose_noise) < 0:
         raise InputError(f"pose_noise is {pose_noise!r}; two numbers (mm, rad), not negative, are needed")
-    for _ in range(NOISE_ROUNDS if isinstance(pose_noise, str) else 1):
-        used = original.select(solution.robust.keep)
-        at = blocks(used, solution.free, solution.fit)
-        if isinstance(pose_noise, str):
-            fit = linear_fit(used, solution.free, solution.fit)
-            noise = estimate_pose_noise(
-                used.covariance,
-                at,
-                fit.J,
-                fit.r,
-                prior_rows=fit.prior_rows,
-                prior_residuals=fit.prior_residuals,
-            )
-        else:
-            noise = PoseNoise(translation=float(pose_noise[0]), rotation=float(pose_noise[1]))
+    return PoseNoise(translation=float(pose_noise[0]), rotation=float(pose_noise[1]))
+
+
+def with_pose_noise(
+    solution: Solution, pose_noise: Any, *, robust: bool = True, maker: Repeatability | None = None
+) -> Solution:
+    """The solution with the manipulator's scatter in the weights.
+
+    pose_noise: None (detection noise only), "auto" (its posterior, with the maker's repeatability as prior; see
+    `pose_noise`), or the standard deviations (mm, rad) of a pose's translation and rotation, a coordinate each.
+    """
+    if pose_noise is None:
+        return solution
+    original, free = solution.problem, solution.free
+    # what did not fit as a whole is not made to fit by setting its worst rows aside
+    robust = robust and not solution.robust.misfit
+    given = _given_noise(pose_noise)
+    rounds = NOISE_ROUNDS if given is None and significant(solution.chi2, solution.dof) else 1
+    for _ in range(rounds):
+        noise = _posterior(original.select(solution.robust.keep), solution, maker) if given is None else given
         if noise.translation == noise.rotation == 0.0:
             return solution
-        everywhere = blocks(original, solution.free, solution.fit)
+        everywhere = blocks(original, free, solution.fit)
         problem = original.with_covariance(total_covariance(original.covariance, everywhere, noise))
-        solution = solve(problem, solution.free, robust=robust, start=solution.fit, noise=noise)
+        solution = solve(problem, free, robust=robust, start=solution.fit, noise=noise)
     return solution
+
+
+def _posterior(used: Problem, solution: Solution, maker: Repeatability | None) -> PoseNoise:
+    free = solution.free
+    at = blocks(used, free, solution.fit)
+    J = jacobian(used, free, at)
+    known = np.zeros(J.shape[2] - len(free))
+    return estimate_pose_noise(
+        used.covariance,
+        at,
+        J,
+        used.x_D - at.x_D,
+        information=np.concatenate([known, free.information]),
+        deviation=np.concatenate([known, solution.fit.delta]),
+        maker=maker,
+    )

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
+from tomopose.calibration.model.unseen import unseen_columns
 from tomopose.calibration.result import Calibration
 from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.manipulator.error_models import correction
@@ -73,19 +74,47 @@ def trajectory_jacobian(calibration: Calibration, poses: PoseSequence, points: A
     after the rigid pose of the object that undoes most of each; and J_pose (n, m, 2, 6) by (w, t) of the plate, rad and
     mm, in H.  `poses` are the commanded ones; identified errors of the manipulator are applied here.
     """
-    scanner, names, R_HT = calibration.scanner, calibration.tangent, calibration.T_HT.R
+    columns, J_pose = _columns(calibration, poses, plate_points(calibration, points))
+    return columns[..., : len(calibration.tangent)], J_pose
+
+
+def plate_points(calibration: Calibration, points: Any) -> Array:
+    """(m, 3) mm in M: points of W at home."""
+    x = np.asarray(points, dtype=np.float64)
+    return np.asarray((calibration.scanner.T_TW(0.0).inv.apply(x) - calibration.T_HT.t) @ calibration.T_HT.R)
+
+
+def scan_jacobian(calibration: Calibration, poses: PoseSequence, x_M: Array) -> tuple[Array, Array]:
+    """(J (n, m, 2, c), C (c, c)): how the pixels of points x_M (m, 3) of the plate answer to what was estimated and to
+    what no ball shows, with the object's rigid pose removed, and the covariance of both."""
+    J, _ = _columns(calibration, poses, x_M)
+    unseen = calibration.unseen
+    if unseen is None:
+        return J, calibration.covariance
+    m = len(calibration.tangent)
+    # the estimate is off by K q, the scan by q itself
+    more = np.einsum("nmic,cq->nmiq", J[..., :m], unseen.gain) - J[..., m:]
+    C = np.zeros((m + len(unseen.names),) * 2)
+    C[:m, :m] = calibration.covariance
+    C[m:, m:] = np.diag(unseen.sigma**2)
+    return np.concatenate([J[..., :m], more], axis=3), C
+
+
+def _columns(calibration: Calibration, poses: PoseSequence, x_M: Array) -> tuple[Array, Array]:
+    """(n, m, 2, c) px by `calibration.tangent` and what is unseen, the object's rigid pose removed; (n, m, 2, 6) px by
+    the plate's pose."""
+    scanner, names, unseen = calibration.scanner, calibration.tangent, calibration.unseen
     fixed = correction(calibration.errors, poses)
     T_MH = fixed.poses.T_MH
-    x = np.asarray(points, dtype=np.float64)
-    x_M = (scanner.T_TW(0.0).inv.apply(x) - calibration.T_HT.t) @ R_HT
-    n, m = len(poses), len(x)
-    J = np.zeros((n, m, 2, len(names)))
+    n, m, c = len(poses), len(x_M), len(names)
+    J = np.zeros((n, m, 2, c + (0 if unseen is None else len(unseen.names))))
     J_pose = np.zeros((n, m, 2, 6))
     rigid_pose = np.zeros((n, m, 2, 6))
     freed = [(j, name.split("[")[0]) for j, name in enumerate(names)]
     errors = [names.index(name) for name in fixed.names]
+    alpha = np.zeros(n) if poses.alpha is None else poses.alpha
     for i in range(m):
-        b = projection_blocks(scanner, T_HT=calibration.T_HT, T_MH=T_MH, t=x_M[i], alpha=poses.alpha)
+        b = projection_blocks(scanner, T_HT=calibration.T_HT, T_MH=T_MH, t=x_M[i], alpha=alpha)
         J_pose[:, i] = np.concatenate([-b.G_H @ skew(b.x_H - T_MH.t), b.G_H], axis=2)
         rigid_pose[:, i] = np.concatenate([-b.J_t @ skew(x_M[i]), b.J_t], axis=2)
         J[:, i, :, :6] = b.J_mount
@@ -94,9 +123,11 @@ def trajectory_jacobian(calibration: Calibration, poses: PoseSequence, points: A
             if name in SCANNER_COLUMNS or name == "pitch_ratio":
                 column, factor = ("p_u", scanner.p_v) if name == "pitch_ratio" else (name, 1.0)
                 J[:, i, :, j] = b.J_scanner[:, :, SCANNER_COLUMNS.index(column)] * factor
+        if unseen is not None:
+            J[:, i, :, c:] = unseen_columns(unseen.names, b, T_HT=calibration.T_HT, origin=T_MH.t, alpha=alpha)
     G = rigid_pose.reshape(-1, 6)
     Q, _ = np.linalg.qr(G / np.linalg.norm(G, axis=0))
-    flat = J.reshape(-1, len(names))
+    flat = J.reshape(-1, J.shape[3])
     flat = flat - Q @ (Q.T @ flat)
     return flat.reshape(J.shape), J_pose
 
@@ -123,15 +154,20 @@ def scatter_variance(calibration: Calibration, poses: PoseSequence, x_M: Any) ->
     return V
 
 
+def shared_variance(calibration: Calibration, poses: PoseSequence, x_M: Array) -> Array:
+    """(n, m, 2) px^2 of points x_M (m, 3) of the plate: the part that all views of a scan share, the object's rigid
+    pose removed."""
+    J, C = scan_jacobian(calibration, poses, x_M)
+    return np.asarray(np.einsum("nmic,cd,nmid->nmi", J, C, J, optimize=True))
+
+
 def trajectory_sigma(calibration: Calibration, poses: PoseSequence, points: Any, *, scatter: bool = False) -> Array:
     """(n, m, 2) px: standard uncertainty of points (m, 3) of W at home in a scan, the object's rigid pose removed.
 
     scatter: add the manipulator's scatter from pose to pose, for the single view; else the part that views share.
     """
-    J, _ = trajectory_jacobian(calibration, poses, points)
-    V = np.einsum("nmic,cd,nmid->nmi", J, calibration.covariance, J, optimize=True)
+    x_M = plate_points(calibration, points)
+    V = shared_variance(calibration, poses, x_M)
     if scatter:
-        x_W = np.asarray(points, dtype=np.float64)
-        x_M = (calibration.scanner.T_TW(0.0).inv.apply(x_W) - calibration.T_HT.t) @ calibration.T_HT.R
         V = V + scatter_variance(calibration, correction(calibration.errors, poses).poses, x_M)
     return np.sqrt(np.maximum(V, 0.0))

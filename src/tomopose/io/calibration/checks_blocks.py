@@ -164,7 +164,8 @@ def comparison_from(row: Mapping[str, Any]) -> ModelComparison:
 
 
 def pose_noise_from(row: Mapping[str, Any]) -> PoseNoiseFound:
-    return PoseNoiseFound(**{f.name: number(row[f.name]) for f in fields(PoseNoiseFound)})
+    values = {f.name: number(row[f.name]) for f in fields(PoseNoiseFound) if f.name != "found"}
+    return PoseNoiseFound(**values, found=bool(row.get("found", True)))
 
 
 def views_document(v: ViewDistances) -> dict[str, Any]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tomopose.calibration.checks.convention_tests import Diagnosis
+from tomopose.calibration.checks.scanner_tests import ScannerTests
 from tomopose.calibration.checks.stability import Stability
+from tomopose.calibration.rigid.contradiction import Contradicted
 
 MISFIT_CHI2 = 4.0
 """chi2/dof of residuals twice as large as stated."""
@@ -66,6 +68,8 @@ class Evidence:
     size:         identified errors over what the machine's file states.
     run_effects:  drift and lag of the run are among the parameters.
     prior_pulls:  (name, deviation from its stated value in prior standard deviations) of each freed parameter.
+    tests:        one effect after the other, beside everything that was assumed; in place of stability's effects.
+    contradicted: scanner values that were freed because the images contradict what was assumed of them.
     open_turns:   the sentence on turns of the plate that no data determine; "" where they are determined.
     """
 
@@ -93,6 +97,8 @@ class Evidence:
     open_turns: str = ""
     ball_size: BallSize | None = None
     prior_pulls: tuple[tuple[str, float], ...] = ()
+    tests: ScannerTests | None = None
+    contradicted: tuple[Contradicted, ...] = ()
 
     @property
     def n(self) -> int:

@@ -182,6 +182,8 @@ def prior_pulls(e: Evidence, limit: float) -> Iterator[Found]:
 
 
 def effects(e: Evidence, limit: float, steps: bool) -> Iterator[Found]:
+    if e.tests is not None:
+        return
     least = EFFECT_SHARE if e.coloured else 0.0
     moved: list[Effect] = [
         x

@@ -1,0 +1,139 @@
+"""What a scan's uncertainty is made of, and what would make it smaller.
+
+The scan is one turn of the table with the plate tilted to and fro by 5 degrees, or, for a manipulator that turns the
+object itself, its own calibration poses.  Points: the field of view's corners and centre.  Everything is what a volume
+sees: a rigid motion of the whole object is taken out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
+from tomopose.calibration.model.budget import ScanBudget
+from tomopose.calibration.model.covariance import inverse_information
+from tomopose.calibration.model.linear_fit import LinearFit
+from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.model.unseen import PLATFORM_RAD, ROTATIONS, TRANSLATIONS
+from tomopose.calibration.result import Calibration
+from tomopose.calibration.uncertainty.propagation import field_of_view_points
+from tomopose.calibration.uncertainty.trajectory import scan_jacobian
+from tomopose.errors import OutOfReachError, TrajectoryError
+from tomopose.geometry.frames import Frame
+from tomopose.geometry.rotations import exp_rotation, log_rotation
+from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.error_models import RigidErrors, TwinErrors
+from tomopose.manipulator.poses import PoseSequence
+from tomopose.units import Array
+
+TILT = np.radians(5.0)
+VIEWS = 12
+
+
+def reference_scan(poses: PoseSequence) -> PoseSequence:
+    """The scan for which the first screen states an uncertainty."""
+    R = poses.T_MH.R
+    if np.linalg.norm(log_rotation(R[0].T @ R), axis=1).max() > PLATFORM_RAD:
+        return poses.select(np.unique(np.linspace(0, len(poses) - 1, 2 * VIEWS).round().astype(int)))
+    alpha = np.linspace(0.0, 2 * np.pi, VIEWS, endpoint=False)
+    w = np.column_stack([TILT * np.sin(2 * alpha), TILT * np.cos(2 * alpha + 0.5), np.zeros(VIEWS)])
+    T_MH = RigidTransform(
+        R=exp_rotation(w), t=np.broadcast_to(poses.T_MH.t.mean(axis=0), (VIEWS, 3)), source=Frame.M, target=Frame.H
+    )
+    return PoseSequence(T_MH=T_MH, pose_id=tuple(str(k) for k in range(VIEWS)), alpha=alpha)
+
+
+def shares_of(
+    J: Array, covariance: Array, columns: dict[str, list[int]]
+) -> tuple[float, float, list[tuple[str, float]]]:
+    """(total, measured, shares): J (k, c) px of the scan, covariance (c, c), columns of what was assumed, by name."""
+    k = max(len(J), 1)
+
+    def rms(C: Array) -> float:
+        return float(np.sqrt(max(np.einsum("kc,cd,kd->", J, C, J, optimize=True) / k, 0.0)))
+
+    def known(C: Array, which: list[int]) -> Array:
+        """The covariance if those coordinates were exact."""
+        S = C[np.ix_(which, which)]
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
+        G = C[:, which] * scale
+        return np.asarray(C - G @ np.linalg.pinv(S * scale[:, None] * scale, rcond=1e-12) @ G.T)
+
+    total = rms(covariance)
+    everything = [j for which in columns.values() for j in which]
+    measured = rms(known(covariance, everything)) if everything else total
+    parts = [
+        (name, float(np.sqrt(max(total**2 - rms(known(covariance, which)) ** 2, 0.0))))
+        for name, which in columns.items()
+    ]
+    return total, measured, sorted(parts, key=lambda p: -p[1])
+
+
+def scan_budget(calibration: Calibration, problem: Problem, linear: LinearFit) -> ScanBudget | None:
+    """The budget of a calibration; None for twin robots, whose scans have two tables, and where no such scan is
+    within reach."""
+    if isinstance(calibration.errors, TwinErrors):
+        return None
+    own = PoseSequence(
+        T_MH=RigidTransform(R=problem.R_MH, t=problem.t_MH, source=Frame.M, target=Frame.H),
+        pose_id=problem.pose_id,
+        alpha=problem.alpha,
+    )
+    scan = reference_scan(own)
+    scanner = calibration.scanner
+    first = scanner.T_TW(float(scan.alpha[0])) @ calibration.T_HT @ scan.T_MH[0]
+    x_M = first.inv.apply(field_of_view_points(scanner))
+    try:
+        J, C = scan_jacobian(calibration, scan, x_M)
+    except (TrajectoryError, OutOfReachError):
+        return None
+    flat = J.reshape(-1, J.shape[-1])
+    names = [*calibration.tangent, *(calibration.unseen.names if calibration.unseen else ())]
+    columns: dict[str, list[int]] = {}
+    held = {a.name for a in calibration.assumed if a.sigma > 0}
+    for j, name in enumerate(names):
+        base = name.split("[")[0]
+        if base in held:
+            columns.setdefault(base, []).append(j)
+        elif j >= len(calibration.tangent):
+            columns.setdefault(_group(name), []).append(j)
+    total, measured, shares = shares_of(flat, C, columns)
+    return ScanBudget(
+        total=total,
+        measured=measured,
+        shares=tuple(shares),
+        two_angles=_with_two_angles(calibration, problem, linear, flat, total),
+    )
+
+
+def _group(name: str) -> str:
+    """What directions that no ball shows are called together."""
+    if name == TRANSLATIONS:
+        return "the scale of the translations"
+    return "the scale of the rotations" if name in ROTATIONS else "the table's wobble"
+
+
+def _with_two_angles(calibration: Calibration, problem: Problem, linear: LinearFit, flat: Array, total: float) -> float:
+    """px: the same, had half of the poses been taken with the table at another angle; nan where that is no remedy."""
+    rigid = isinstance(calibration.errors, RigidErrors) and calibration.arrangement == "moving-object"
+    if not rigid or np.ptp(problem.alpha) > 0 or len(problem.ball_ids) > 1 or len(problem.scanners) > 1:
+        return float("nan")
+    b = projection_blocks(
+        calibration.scanner,
+        T_HT=calibration.T_HT,
+        T_MH=RigidTransform(R=problem.R_MH, t=problem.t_MH, source=Frame.M, target=Frame.H),
+        t=calibration.t,
+        alpha=problem.alpha + np.pi / 2,
+    )
+    if not np.isfinite(b.x_D).all():
+        return float("nan")
+    scanner_part = [SCANNER_COLUMNS.index(n) if n in SCANNER_COLUMNS else -1 for n in calibration.tangent[9:]]
+    if -1 in scanner_part:
+        return float("nan")
+    J = np.concatenate([b.J_mount, b.J_t, b.J_scanner[:, :, scanner_part]], axis=2)
+    turned = (linear.W @ J).reshape(-1, J.shape[2])
+    now = linear.J_white.reshape(-1, J.shape[2])
+    N = (now.T @ now + turned.T @ turned) / 2 + linear.prior_rows.T @ linear.prior_rows
+    m = len(calibration.tangent)
+    C = inverse_information(N)
+    return float(np.sqrt(max(np.einsum("kc,cd,kd->", flat[:, :m], C, flat[:, :m], optimize=True) / len(flat), 0.0)))

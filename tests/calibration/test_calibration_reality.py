@@ -1,0 +1,208 @@
+"""A scanner as it is, not as it was declared: small cases with their right values, and what must never be silent."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calibration_cases import BALL, MOUNT, SCANNER, mixed_poses, observe, paper_poses
+
+import tomopose as tp
+from tomopose.calibration.model.budget import budget_words
+from tomopose.calibration.result import Calibration
+
+SILENT = replace(SCANNER, sigma={})
+
+
+def case(folder: Path, **options: object) -> tuple[Calibration, dict[str, list[float]]]:
+    found = tp.calibrate(
+        tp.read_scanner(folder / "scanner.json"),
+        tp.read_poses(folder / "poses.csv"),
+        tp.read_observations(folder / "observations.csv"),
+        **options,
+    )
+    return found, json.loads((folder / "expected.json").read_text(encoding="utf-8"))
+
+
+def pulls(cal: Calibration, t_HT: list[float]) -> np.ndarray:
+    """t_HT minus the truth, in stated standard uncertainties."""
+    by_name = {p.name: p for p in cal.parameters}
+    return np.array(
+        [(by_name[f"t_HT_{c}"].value - t) / by_name[f"t_HT_{c}"].u for c, t in zip("xyz", t_HT, strict=True)]
+    )
+
+
+@pytest.mark.parametrize("name", ["calibrate-roll", "calibrate-u0", "calibrate-tilt"])
+def test_what_nobody_stated_lies_within_the_stated_uncertainty(shared_data, name):
+    cal, right = case(shared_data / "cases" / name)
+    assert np.abs(pulls(cal, right["t_HT_mm"])).max() < 3.0
+    assert {a.name: a.source for a in cal.assumed}["eta"] == "default"
+
+
+def test_a_tilted_panel_is_named_and_no_drift_or_bump_is(shared_data):
+    cal, _ = case(shared_data / "cases" / "calibrate-tilt")
+    assert "theta" in cal.explanations[0].words
+    assert not any(word in text for text in cal.reasons for word in ("drift", "mount", "slipped", "jumped"))
+
+
+def test_a_bump_before_the_last_poses_is_named_at_its_pose(shared_data):
+    cal, _ = case(shared_data / "cases" / "calibrate-bump")
+    assert cal.verdict != "trustworthy"
+    assert any("mount changed" in r and "pose 56" in r for r in cal.reasons)
+    assert any("before 56" in f.remedy for f in cal.checks)
+
+
+def test_a_closing_pose_that_is_off_is_never_silent(shared_data):
+    cal, right = case(shared_data / "cases" / "calibrate-repeat")
+    assert np.abs(pulls(cal, right["t_HT_mm"])).max() < 3.0
+    assert any("59" in f.words for f in cal.checks if f.rule == "set aside")
+    assert any("taken again as 59" in f.words for f in cal.checks)
+
+
+def test_certificate_sigmas_with_the_table_still_give_a_result(shared_data):
+    cal, _ = case(shared_data / "cases" / "calibrate-crash")
+    assert cal.verdict in ("trustworthy", "doubtful", "rejected")
+    assert {a.name: a.source for a in cal.assumed}["d_SR"] == "scanner.json"
+
+
+def test_the_first_screen_says_what_the_uncertainty_is_made_of_and_what_would_help():
+    poses = paper_poses()
+    cal = tp.calibrate(SILENT, poses, observe(poses))
+    words = budget_words(cal.budget, cal.assumed)
+    assert "no sigma given" in words
+    assert "mrad assumed" in words
+    assert "Two table angles would make it" in words
+    assert cal.budget.two_angles < 0.1 * cal.budget.total
+
+
+def test_sigma_zero_is_exact_and_silence_is_not():
+    poses = paper_poses()
+    exact, silent = (tp.calibrate(s, poses, observe(poses)) for s in (SCANNER, SILENT))
+    assert {a.source for a in exact.assumed} == {"exact"}
+    u = {name: {p.name: p.u for p in cal.parameters}["t_HT_x"] for name, cal in (("exact", exact), ("silent", silent))}
+    assert u["silent"] > 20 * u["exact"]
+
+
+def test_everything_assumed_is_in_the_pixels_of_a_scan():
+    poses, scan = paper_poses(), tp.circular_scan(8)
+    sigma = {}
+    for name, s in (("exact", SCANNER), ("silent", SILENT)):
+        sigma[name] = tp.projection_matrices(tp.calibrate(s, poses, observe(poses)), scan).points_sigma_shared
+    assert np.mean(sigma["silent"]) > 10 * np.mean(sigma["exact"])
+
+
+def test_two_table_angles_find_the_roll_that_one_cannot_show():
+    rolled = replace(SCANNER, eta=2e-3)
+    poses = mixed_poses(n=80)
+    # a tilt of the table axis about the beam is the same as a roll: the axis is taken as exact here
+    axis = {f"axis_{name}": 0.0 for name in ("y", "tilt_x", "tilt_y")}
+    cal = tp.calibrate(replace(SILENT, sigma=axis), poses, observe(poses, scanner=rolled))
+    eta = {p.name: p for p in cal.parameters}["eta"]
+    assert abs(eta.value - 2e-3) < 3 * eta.u < 0.2e-3
+    assert "eta" in cal.explanations[0].words
+    assert cal.verdict == "trustworthy"
+
+
+def test_a_value_that_the_images_contradict_is_freed_and_said_unless_nothing_may_be():
+    wrong = replace(SCANNER, u_0=SCANNER.u_0 + 4.0)
+    poses = mixed_poses(n=80)
+    stated = replace(SCANNER, sigma={**SCANNER.sigma, "u_0": 0.1})
+    seen = observe(poses, scanner=wrong)
+    freed = tp.calibrate(stated, poses, seen)
+    u_0 = {p.name: p for p in freed.parameters}["u_0"]
+    assert abs(u_0.value - wrong.u_0) < 4 * u_0.u
+    assert [c.name for c in freed.contradicted] == ["u_0"]
+    assert any(f.rule == "value freed" and "u_0" in f.words for f in freed.checks)
+    assert tp.calibrate(stated, poses, seen, free="none").contradicted == ()
+
+
+def test_a_scatter_that_is_not_significant_is_an_upper_limit_and_never_zero():
+    poses = mixed_poses(n=60)
+    cal = tp.calibrate(SCANNER, poses, observe(poses))
+    noise = cal.pose_noise
+    assert noise is not None
+    assert not noise.found
+    assert 1e-5 < noise.translation_mm < 5e-4
+    assert 1e-7 < noise.rotation_rad < 12e-6
+
+
+def test_the_makers_repeatability_is_the_prior_of_the_scatter():
+    from tomopose.manipulator.real_poses import Repeatability
+
+    poses = mixed_poses(n=40)
+    fine, coarse = (
+        tp.calibrate(SCANNER, poses, observe(poses), repeatability=Repeatability(t_mm=t, w_rad=w)).pose_noise
+        for t, w in ((2e-5, 1e-7), (5e-3, 5e-5))
+    )
+    assert fine is not None
+    assert coarse is not None
+    assert fine.translation_mm < 0.5 * coarse.translation_mm
+
+
+def test_runs_whose_scanner_is_drawn_from_the_defaults_are_accused_of_nothing():
+    from tomopose.calibration.model.assumed import assumed_of
+
+    poses = mixed_poses(n=60)
+    inside = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        drawn = {a.name: a.value + a.sigma * rng.standard_normal() for a in assumed_of(SILENT)}
+        cal = tp.calibrate(SILENT, poses, observe(poses, scanner=replace(SCANNER, **drawn), seed=seed))
+        assert cal.verdict == "trustworthy", cal.reasons
+        inside += list(np.abs(pulls(cal, MOUNT.t.tolist())) < 1.96)
+    assert np.mean(inside) > 0.8
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (lambda x, n: x + 0.3 * np.linspace(0, 1, n)[:, None], "drift"),
+        (lambda x, n: x + 0.2 * (np.arange(n) >= 40)[:, None], "pose 40"),
+    ],
+)
+def test_what_moves_with_time_is_named(change, word):
+    poses = mixed_poses(n=80)
+    seen = observe(poses)
+    seen = replace(seen, x_D=change(np.asarray(seen.x_D), len(poses)))
+    cal = tp.calibrate(SILENT, poses, seen)
+    assert cal.verdict == "doubtful"
+    assert any(word in r for r in cal.reasons)
+
+
+def test_a_distorted_panel_is_named():
+    poses = mixed_poses(n=120)
+    seen = observe(poses)
+    x = np.asarray(seen.x_D)
+    middle = np.array([SCANNER.n_u - 1, SCANNER.n_v - 1]) / 2
+    q = (x - middle) / np.linalg.norm(middle)
+    bent = replace(seen, x_D=x + 1.5 * q * (q * q).sum(axis=1, keepdims=True))
+    cal = tp.calibrate(SILENT, poses, bent)
+    assert cal.verdict == "doubtful"
+    assert "radial distortion" in cal.explanations[0].words
+
+
+def test_an_assumed_scanner_still_refuses_the_scan_of_another_one():
+    poses = mixed_poses(n=40)
+    cal = tp.calibrate(SILENT, poses, observe(poses))
+    tp.projection_matrices(cal, poses, scanner=SILENT)
+    with pytest.raises(tp.errors.InputError, match="d_SR"):
+        tp.projection_matrices(cal, poses, scanner=replace(SILENT, d_SR=290.0))
+
+
+def test_what_was_assumed_survives_the_file(tmp_path):
+    poses = mixed_poses(n=40)
+    cal = tp.calibrate(SILENT, poses, observe(poses))
+    tp.write_calibration(tmp_path / "calibration.json", cal)
+    again = tp.read_calibration(tmp_path / "calibration.json")
+    assert again.assumed == cal.assumed
+    assert again.budget == cal.budget
+    scan = tp.circular_scan(4)
+    np.testing.assert_array_equal(
+        tp.projection_matrices(again, scan).points_sigma, tp.projection_matrices(cal, scan).points_sigma
+    )
+    document = json.loads((tmp_path / "calibration.json").read_text(encoding="utf-8"))
+    assert {"name", "sigma", "unit", "from"} <= set(document["assumed"][0])
+    assert BALL.shape == (3,)
