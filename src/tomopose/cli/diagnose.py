@@ -46,7 +46,7 @@ def ranking(o: Options, given: Inputs) -> Diagnosis:
     import tomopose as tp
 
     poses, observed = given.poses, given.observations
-    free, fix = names(o.free), names(o.fix)
+    free, fix = () if o.free in ("auto", "none") else names(o.free), names(o.fix)
     if given.twin is not None:
         robots, mount = twin_robots(o, given), given.twin.mount(given.scanner)
         return tp.diagnose_twin(given.scanner, poses, observed, twin=robots, mount=mount, free=free, fix=fix)
