@@ -133,7 +133,7 @@ def _rigid(
             ),
             assumed=taken.assumed,
             contradicted=taken.contradicted,
-            tests=_tests(solution, chi2),
+            tests=_tests(stated),
             unseen=_unseen(solution, linear, moving_scanner=arrangement == "moving-scanner"),
             provenance=provenance(arguments=arguments),
         )
@@ -148,9 +148,12 @@ class Taken:
     contradicted: tuple[Contradicted, ...] = ()
 
 
-def _tests(solution: Solution, stated_chi2: float) -> ScannerTests | None:
-    """One effect after the other, on all rows but those that chance may have spoilt; None where nothing fits."""
-    if not solution.fit.converged or stated_chi2 > NOTHING_FITS * 2 * len(solution.used):
+def _tests(solution: Solution) -> ScannerTests | None:
+    """One effect after the other, on all rows but those that chance may have spoilt; None where nothing fits.
+
+    With the stated sigmas alone: a scatter that was estimated from the effect would hide it.
+    """
+    if not solution.fit.converged or solution.chi2 > NOTHING_FITS * 2 * len(solution.used):
         return None
     rows = np.flatnonzero(rows_to_test(solution.robust.keep))
     problem = solution.problem.select(rows)

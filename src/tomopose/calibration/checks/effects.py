@@ -108,8 +108,8 @@ def _length(name: str, kind: str, short: str, text: str, factor: float, order: i
     """A drift: its reach is the largest distance between two moments of the run."""
 
     def words(size: Array, px: float, at: str) -> str:
-        course = np.polynomial.legendre.legvander(np.linspace(-1, 1, 40), order)[:, 1:]
-        path = course @ size.reshape(order, -1)
+        course = np.polynomial.legendre.legvander(np.linspace(-1, 1, 40), order)
+        path = course @ size.reshape(order + 1, -1)
         return text.format(largest_distance(path) * factor)
 
     return Effect(name=name, kind=kind, short=short, words=words)
@@ -262,8 +262,9 @@ def _mount(b: ProjectionBlocks) -> Array:
 
 
 def _drifts(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
+    """About a constant that is free: nobody knows at which moment of the run the values of the scanner hold."""
     tau = elapsed(problem)
-    course = np.polynomial.legendre.legvander(2.0 * tau / np.ptp(tau) - 1.0, DRIFT_ORDER)[:, 1:]
+    course = np.polynomial.legendre.legvander(2.0 * tau / np.ptp(tau) - 1.0, DRIFT_ORDER)
     found = []
     image = np.broadcast_to(np.eye(2), (len(problem), 2, 2))
     for order, ending in ((1, "linear"), (DRIFT_ORDER, "curved")):
@@ -277,7 +278,7 @@ def _drifts(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
             ),
             ("ball drift", "drift of the ball", "the ball drifts by {:.2g} um over the run", 1000.0, b.J_t_HT),
         ):
-            C = (base[:, :, None, :] * course[:, None, :order, None]).reshape(len(problem), 2, -1)
+            C = (base[:, :, None, :] * course[:, None, : order + 1, None]).reshape(len(problem), 2, -1)
             effect = _length(name if order > 1 else f"{name}, {ending}", "time", short, text, factor, order)
             found.append(Columns(effect=effect, C=_white(problem, C)))
     return found
@@ -323,7 +324,7 @@ def steps_of(problem: Problem, b: ProjectionBlocks) -> list[Steps]:
             effect=_step_effect(
                 "image step",
                 "the images jumped",
-                "the images jumped (focal spot or detector)",
+                "the images changed their place (jumped: focal spot or detector)",
                 slice(0, 2),
                 1.0,
                 "px",

@@ -18,13 +18,13 @@ class ScanBudget:
     """px, root mean square over views, points and coordinates.
 
     total: with everything;  measured: if all that was assumed were exact;  shares: assumed name -> its part, largest
-    first;  two_angles: the same poses, half of them at a second table angle; nan where that is no remedy.
+    first;  two_angles: the same poses, half of them at a second table angle; None where that is no remedy.
     """
 
     total: float
     measured: float
     shares: tuple[tuple[str, float], ...] = ()
-    two_angles: float = float("nan")
+    two_angles: float | None = None
 
 
 def budget_words(budget: ScanBudget, assumed: tuple[Assumed, ...]) -> str:
@@ -44,6 +44,6 @@ def budget_words(budget: ScanBudget, assumed: tuple[Assumed, ...]) -> str:
         value = f"{1000 * a.sigma:.3g} mrad" if a.unit == "rad" else f"{a.sigma:.3g} {a.unit}"
         parts.append(f"{px:.2g} px from {name} ({said}{value} assumed)")
     words += f", of which {', '.join(parts)}." if parts else "."
-    if budget.two_angles < WORTH_NAMING * budget.total:
+    if budget.two_angles is not None and budget.two_angles < WORTH_NAMING * budget.total:
         words += f" Two table angles would make it {budget.two_angles:.1g} px."
     return words

@@ -113,11 +113,13 @@ def _group(name: str) -> str:
     return "the scale of the rotations" if name in ROTATIONS else "the table's wobble"
 
 
-def _with_two_angles(calibration: Calibration, problem: Problem, linear: LinearFit, flat: Array, total: float) -> float:
-    """px: the same, had half of the poses been taken with the table at another angle; nan where that is no remedy."""
+def _with_two_angles(
+    calibration: Calibration, problem: Problem, linear: LinearFit, flat: Array, total: float
+) -> float | None:
+    """px: the same, had half of the poses been taken with the table at another angle; None where that is no remedy."""
     rigid = isinstance(calibration.errors, RigidErrors) and calibration.arrangement == "moving-object"
     if not rigid or np.ptp(problem.alpha) > 0 or len(problem.ball_ids) > 1 or len(problem.scanners) > 1:
-        return float("nan")
+        return None
     b = projection_blocks(
         calibration.scanner,
         T_HT=calibration.T_HT,
@@ -126,10 +128,10 @@ def _with_two_angles(calibration: Calibration, problem: Problem, linear: LinearF
         alpha=problem.alpha + np.pi / 2,
     )
     if not np.isfinite(b.x_D).all():
-        return float("nan")
+        return None
     scanner_part = [SCANNER_COLUMNS.index(n) if n in SCANNER_COLUMNS else -1 for n in calibration.tangent[9:]]
     if -1 in scanner_part:
-        return float("nan")
+        return None
     J = np.concatenate([b.J_mount, b.J_t, b.J_scanner[:, :, scanner_part]], axis=2)
     turned = (linear.W @ J).reshape(-1, J.shape[2])
     now = linear.J_white.reshape(-1, J.shape[2])

@@ -44,7 +44,7 @@ def _budget(b: ScanBudget, cal: Calibration) -> dict[str, Any]:
         "px": encode(b.total),
         "measured_px": encode(b.measured),
         "shares_px": {name: encode(px) for name, px in b.shares},
-        "two_table_angles_px": encode(b.two_angles),
+        "two_table_angles_px": b.two_angles,
         "words": budget_words(b, cal.assumed),
     }
 
@@ -93,6 +93,6 @@ def from_document(document: Mapping[str, Any], m: int) -> dict[str, Any]:
             total=number(budget["px"]),
             measured=number(budget["measured_px"]),
             shares=tuple((name, number(px)) for name, px in budget["shares_px"].items()),
-            two_angles=number(budget["two_table_angles_px"]),
+            two_angles=None if budget["two_table_angles_px"] is None else float(budget["two_table_angles_px"]),
         ),
     }
