@@ -305,7 +305,9 @@ def test_tiff_pages_in_a_circle(tmp_path, big):
         open_images(path)
 
 
-@pytest.mark.parametrize(("tag", "value", "words"), [(256, 2**31, "side of"), (256, 60000, "truncated|would take")])
+@pytest.mark.parametrize(
+    ("tag", "value", "words"), [(256, 2**31, "side of"), (257, 0, "side of 0"), (256, 60000, "truncated|would take")]
+)
 def test_tiff_that_claims_more_pixels_than_it_has(tmp_path, tag, value, words):
     path = tiff(tmp_path, compression="zlib")
     with tifffile.TiffFile(path) as file:

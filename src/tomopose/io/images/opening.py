@@ -24,6 +24,7 @@ from tomopose.io.images.raw import RawLayout, open_raw
 from tomopose.io.images.sequence import ImageSequence, Rows
 from tomopose.io.images.stated import contradictions
 from tomopose.io.images.tiff import open_tiff
+from tomopose.reading import reading
 
 SUFFIXES = {
     ".tif": "TIFF",
@@ -97,6 +98,8 @@ def open_images(
         odd = next(p for p in paths if kinds[p] != kinds[paths[0]])
         raise InputError(f"{paths[0]} is {kinds[paths[0]]}, {odd} is {kinds[odd]}; give images of one format")
     frames = _open(paths, kinds[paths[0]], raw_layout, dataset)
+    if 0 in frames.shape:
+        raise FileError(f"{paths[0]} holds an image of {frames.shape[1]} x {frames.shape[0]} pixels", path=paths[0])
     order = _rows(frames, rows, scanner)
     if scanner is not None:
         require_scanner_shape(frames.shape, scanner, frames.names[0])
@@ -111,7 +114,8 @@ def open_images(
     gaps = missing_numbers(frames.names)
     if gaps:
         notes.append(f"the numbering leaves out {len(gaps)} numbers, the first is {gaps[0]}")
-    notes += endianness_note(plain[0], frames.names[0])
+    with reading(paths[0], "radiograph"):
+        notes += endianness_note(plain[0], frames.names[0])
     bad = None if bad_pixels is None else _mask(bad_pixels, frames.shape)
     D, F = _mean(dark, order, raw_layout), _mean(flat, order, raw_layout)
     if isinstance(frames, Hdf5Source) and D is None and F is None and frames.flats:

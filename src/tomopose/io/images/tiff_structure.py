@@ -92,6 +92,8 @@ def _page_bytes(stream: BinaryIO, form: _Form, path: Path, size: int, page: int)
     sides = [found.get(tag, 1) for tag in (WIDTH, LENGTH, TILE_WIDTH, TILE_LENGTH)]
     if max(sides) > LARGEST_SIDE or found.get(SAMPLES, 1) > 65535:
         raise FileError(f"{path} is damaged: page {page} claims a side of {max(sides)} pixels", path=path)
+    if min(sides) < 1:
+        raise FileError(f"{path} is damaged: page {page} claims a side of {min(sides)} pixels", path=path)
     width, length, tile_width, tile_length = sides
     bits = max(found.get(BITS, 16), 8) * max(found.get(SAMPLES, 1), 1)
     require_plausible(path, f"page {page} of {width} x {length} pixels", width * length * bits // 8, size)
