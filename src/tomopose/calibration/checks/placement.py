@@ -13,8 +13,8 @@ from tomopose.errors import InputError
 from tomopose.units import Array
 
 OUTSIDE = 0.5
-"""Of the panel's larger side.  A simulated or predicted table may reach beyond the panel and is right all the same; other
-units, another binning or another scanner put centres farther away than half a panel."""
+"""Of the panel's larger side.  A simulated or predicted table may reach beyond the panel and is right all the same;
+other units, another binning or another scanner put centres farther away than half a panel."""
 
 
 @dataclass(frozen=True, kw_only=True)
