@@ -38,7 +38,7 @@ def require_same_scanner(calibration: Calibration, scanner: Scanner) -> None:
     own = calibration.scanner
     freed = {p.name for p in calibration.parameters}
     # what was estimated with a prior is compared with the value that the prior was about
-    given = {a.name: a.value for a in calibration.assumed}
+    given = {a.name: a.value for a in calibration.assumed if a.value is not None}
     for name in ("n_u", "n_v", *PARAMETER_UNITS):
         a, b = given.get(name, getattr(own, name)), getattr(scanner, name)
         if (name not in given and name in freed) or (name == "p_u" and "pitch_ratio" in freed):

@@ -67,16 +67,16 @@ Source: TypeAlias = Literal["scanner.json", "default", "exact", "option"]
 class Assumed:
     """A value that enters the result with an uncertainty that was not measured here.
 
-    value: as it was given;  sigma: standard uncertainty in `unit`.
+    value: as it was given, None where that is not known;  sigma: standard uncertainty in `unit`.
     source: "scanner.json" (the user's number), "default" (nobody stated any), "exact" (the user's 0, or `fix`),
     "option" (priors).
     """
 
     name: str
-    value: float
     sigma: float
     unit: str
     source: Source
+    value: float | None = None
 
 
 def default_sigma(scanner: Scanner, name: str) -> float:

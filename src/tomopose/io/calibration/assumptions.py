@@ -20,10 +20,7 @@ from tomopose.io.numbers_json import decode_array, encode
 def document(cal: Calibration) -> dict[str, Any]:
     """The keys assumed, unseen, explanations, contradicted and scan_uncertainty."""
     unseen = cal.unseen
-    stated = [
-        {"name": a.name, "value": encode(a.value), "sigma": encode(a.sigma), "unit": a.unit, "from": a.source}
-        for a in cal.assumed
-    ]
+    stated = [{"name": a.name, "sigma": encode(a.sigma), "unit": a.unit, "from": a.source} for a in cal.assumed]
     if unseen is not None:
         # one list for the reader; the gains that belong to these stand under "unseen"
         stated += [
@@ -32,6 +29,7 @@ def document(cal: Calibration) -> dict[str, Any]:
         ]
     return {
         "assumed": stated,
+        "assumed_values": {a.name: encode(a.value) for a in cal.assumed if a.value is not None},
         "unseen": None if unseen is None else {"names": list(unseen.names), "gain": encode(np.asarray(unseen.gain))},
         "explanations": [e.to_json() for e in cal.explanations],
         "contradicted": [{"name": c.name, "stated": encode(c.stated), "off": encode(c.off)} for c in cal.contradicted],
@@ -53,11 +51,16 @@ def from_document(document: Mapping[str, Any], m: int) -> dict[str, Any]:
     """The fields of a Calibration with m coordinates; a file without them has none of it."""
     unseen, budget = document.get("unseen"), document.get("scan_uncertainty")
     rows = {a["name"]: a for a in document["assumed"]}
+    values = document.get("assumed_values", {})
     names = () if unseen is None else tuple(unseen["names"])
     return {
         "assumed": tuple(
             Assumed(
-                name=a["name"], value=number(a.get("value")), sigma=number(a["sigma"]), unit=a["unit"], source=a["from"]
+                name=a["name"],
+                value=number(values[a["name"]]) if a["name"] in values else None,
+                sigma=number(a["sigma"]),
+                unit=a["unit"],
+                source=a["from"],
             )
             for a in rows.values()
             if a["name"] not in names
