@@ -238,7 +238,7 @@ def _volumes(folder: Path) -> Iterator[Seed]:
     values = np.random.default_rng(3).normal(size=grid.shape).astype(np.float32)
     one = tp.Volume(values=values, grid=grid, view_residual=np.zeros(4))
     for suffix in ("h5", "tif", "nrrd", "mhd"):
-        write_volume(one, folder / f"v.{suffix}")
+        write_volume(folder / f"v.{suffix}", one)
     for suffix in ("h5", "tif", "nrrd"):
         yield Seed(kind=f"volume {suffix}", path=folder / f"v.{suffix}", read=volume)
     yield Seed(kind="volume mhd", path=folder / "v.mhd", read=volume, beside=(folder / "v.raw",))

@@ -54,7 +54,7 @@ def write_matrices(folder: Path, state: int) -> None:
 
 def write_hdf5_volume(folder: Path, state: int) -> None:
     grid = tp.VoxelGrid(shape=(20, 60, 60), spacing=0.1)
-    write_volume(tp.Volume(values=np.full(grid.shape, state, np.float32), grid=grid), folder / "out.h5", force=True)
+    write_volume(folder / "out.h5", tp.Volume(values=np.full(grid.shape, state, np.float32), grid=grid), force=True)
 
 
 WRITERS: dict[str, Callable[[Path, int], None]] = {

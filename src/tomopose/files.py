@@ -90,8 +90,11 @@ class EditedWarning(UserWarning):
 
 
 def _digest(document: Mapping[str, Any]) -> str:
-    """SHA-256 over a JSON object's content but the digest's own entry, whatever its layout and order."""
+    """SHA-256 over a JSON object's content, whatever its layout and order, but for the digest itself and the time at
+    which it was written: the same input gives the same digest."""
     content = {key: value for key, value in document.items() if key != DIGEST}
+    if isinstance(content.get("provenance"), dict):
+        content["provenance"] = {k: v for k, v in content["provenance"].items() if k != "time_utc"}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()
 

@@ -116,10 +116,10 @@ def test_a_mask_keeps_the_rest_empty_and_must_lie_on_the_grid(scan, capsys):
     grid = tp.VoxelGrid.cube(n=45, spacing=0.6)
     allowed = np.zeros(grid.shape, dtype=np.float32)
     allowed[10:-10, 10:-10, 10:-10] = 1
-    tp.write_volume(tp.Volume(values=allowed, grid=grid), scan / "allowed.h5")
+    tp.write_volume(scan / "allowed.h5", tp.Volume(values=allowed, grid=grid))
     assert run(words(scan, "--images-are", "transmission", "--mask", scan / "allowed.h5", "--quiet")) == 0
     assert not tp.read_volume(scan / "volume.h5").values[allowed == 0].any()
-    tp.write_volume(tp.Volume(values=allowed, grid=tp.VoxelGrid.cube(n=45, spacing=0.61)), scan / "other.h5")
+    tp.write_volume(scan / "other.h5", tp.Volume(values=allowed, grid=tp.VoxelGrid.cube(n=45, spacing=0.61)))
     assert run(words(scan, "--images-are", "transmission", "--mask", scan / "other.h5", "--force")) == 1
     assert "other.h5: its grid is not" in capsys.readouterr().err
 

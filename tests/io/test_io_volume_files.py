@@ -34,7 +34,7 @@ def volume(rng):
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_values_and_geometry_return(suffix, volume, tmp_path):
-    path = write_volume(volume, tmp_path / f"v{suffix}")
+    path = write_volume(tmp_path / f"v{suffix}", volume)
     found = read_volume(path)
     assert np.array_equal(found.values, volume.values)
     assert found.values.dtype == np.float32
@@ -44,7 +44,7 @@ def test_values_and_geometry_return(suffix, volume, tmp_path):
 
 
 def test_hdf5_keeps_all_that_a_volume_knows(volume, tmp_path):
-    path = write_volume(volume, tmp_path / "v.h5")
+    path = write_volume(tmp_path / "v.h5", volume)
     found = read_volume(path)
     assert found.notes == ("short scan",)
     assert found.settings == {"algorithm": "sart"}
@@ -62,7 +62,7 @@ def test_itk_sees_the_same_place(suffix, volume, tmp_path):
     if not rtk.availability().available:
         pytest.skip(rtk.availability().reason)
     itk, _ = rtk.load_itk()
-    image = itk.imread(str(write_volume(volume, tmp_path / f"v{suffix}")))
+    image = itk.imread(str(write_volume(tmp_path / f"v{suffix}", volume)))
     assert np.allclose(list(image.GetOrigin()), volume.grid.origin, atol=1e-12)
     assert np.allclose(list(image.GetSpacing()), volume.grid.spacing, atol=1e-12)
     assert np.allclose(itk.array_from_matrix(image.GetDirection()), np.eye(3))
@@ -70,27 +70,33 @@ def test_itk_sees_the_same_place(suffix, volume, tmp_path):
 
 
 def test_nothing_is_overwritten_unasked(volume, tmp_path):
-    path = write_volume(volume, tmp_path / "v.mhd")
+    path = write_volume(tmp_path / "v.mhd", volume)
     with pytest.raises(FileError, match="exists already"):
-        write_volume(volume, path)
-    write_volume(volume, path, force=True)
+        write_volume(path, volume)
+    write_volume(path, volume, force=True)
     assert sorted(os.listdir(tmp_path)) == ["v.mhd", "v.raw"]
 
 
 def test_bad_files_are_named(volume, tmp_path):
     with pytest.raises(FileError, match="no volume format"):
-        write_volume(volume, tmp_path / "v.vol")
+        write_volume(tmp_path / "v.vol", volume)
     with pytest.raises(FileError, match="does not exist"):
         read_volume(tmp_path / "absent.h5")
     (tmp_path / "broken.h5").write_bytes(b"nothing of the kind")
     with pytest.raises(FileError, match="no readable volume"):
         read_volume(tmp_path / "broken.h5")
-    path = write_volume(volume, tmp_path / "other.h5")
+    path = write_volume(tmp_path / "other.h5", volume)
     with h5py.File(path, "a") as file:
         file.attrs["schema"] = "tomopose/volume/2"
     with pytest.raises(SchemaVersionError, match="tomopose/volume/2"):
         read_volume(path)
-    whole = write_volume(volume, tmp_path / "cut.nrrd").read_bytes()
+    whole = write_volume(tmp_path / "cut.nrrd", volume).read_bytes()
     (tmp_path / "cut.nrrd").write_bytes(whole[:-40])
     with pytest.raises(FileError, match="no readable volume"):
         read_volume(tmp_path / "cut.nrrd")
+
+
+def test_the_earlier_order_of_arguments_is_named_and_still_writes(volume, tmp_path):
+    with pytest.warns(DeprecationWarning, match=r"write_volume\(path, volume\) is the order now"):
+        path = write_volume(volume, tmp_path / "v.h5")
+    assert read_volume(path).grid == volume.grid

@@ -46,7 +46,7 @@ def folder(tmp_path_factory):
     (folder / "repeats.toml").write_text(PLAN + REPEATS, encoding="utf-8")
     (folder / "simple.toml").write_text(PLAN.replace('kind = "datum"', 'kind = "none"'), encoding="utf-8")
     for k in (1, 2, 3):
-        write_volume(block(0.03, k), folder / f"scan{k}.h5")
+        write_volume(folder / f"scan{k}.h5", block(0.03, k))
     write_stl(folder / "part.stl", box(HALF, 10))
     write_stl(folder / "coarse.stl", box(HALF, 1))
     write_stl(folder / "metres.stl", Mesh(points=box(HALF, 10).points / 1000, faces=box(HALF, 10).faces))
@@ -384,12 +384,12 @@ class TestRefused:
 
     def test_an_empty_volume(self, folder):
         empty = block()
-        write_volume(replace(empty, values=np.zeros_like(empty.values)), folder / "empty.h5")
+        write_volume(folder / "empty.h5", replace(empty, values=np.zeros_like(empty.values)))
         with pytest.raises(InputError, match="no surface"):
             run(folder / "plan.toml", "--volume", folder / "empty.h5", "--out", folder / "refused")
 
     def test_an_inverted_volume(self, folder):
         scan = block()
-        write_volume(replace(scan, values=1 - scan.values), folder / "inverted.h5")
+        write_volume(folder / "inverted.h5", replace(scan, values=1 - scan.values))
         with pytest.raises(InputError, match="inverted"):
             run(folder / "plan.toml", "--volume", folder / "inverted.h5", "--out", folder / "refused")

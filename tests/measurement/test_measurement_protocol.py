@@ -146,7 +146,7 @@ def test_the_command_writes_the_protocol_and_ends_with_3_where_a_limit_is_exceed
     centres = 2.1 * lattice + rng.uniform(-0.4, 0.4, lattice.shape)
     grid = VoxelGrid.cube(n=60, spacing=0.12)
     volume = as_volume(balls_volume(grid, centres, np.full(7, 0.9), 0.12), grid)
-    write_volume(volume, tmp_path / "scan.h5")
+    write_volume(tmp_path / "scan.h5", volume)
     plan = f"""
 schema = "tomopose/measurement-plan/1"
 unit = "mm"

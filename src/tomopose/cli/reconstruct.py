@@ -285,7 +285,7 @@ def reconstruct(options: Options) -> int:
     inputs = [path for path in (o.matrices, o.scanner, o.bad_pixels, o.mask, o.scene) if path is not None]
     asked = arguments(voxel_mm=o.voxel, size=o.size, centre_mm=o.centre, paper=o.paper, **volume.settings)
     volume = replace(volume, provenance=provenance(inputs=inputs, arguments=asked))
-    tp.write_volume(volume, target, force=o.force)
+    tp.write_volume(target, volume, force=o.force)
     write_beside(o, volume)
     said(o, volume)
     return OK if volume.trustworthy else NOT_TRUSTWORTHY

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +30,17 @@ SCHEMA = "tomopose/volume/1"
 SUFFIXES = (".h5", ".tif", ".tiff", ".nrrd", ".mhd")
 
 
-def write_volume(volume: Volume, path: str | Path, *, force: bool = False) -> Path:
+def write_volume(path: str | Path, volume: Volume, *, force: bool = False) -> Path:
     """Write a volume in the format that the suffix names: .h5, .tif, .tiff, .nrrd or .mhd (with a .raw beside it).
 
     Written layer by layer and atomically.  FileError where the suffix is another one, or something is there already
-    and `force` is not given.
+    and `force` is not given.  The order (volume, path) of version 0.1 is accepted with a DeprecationWarning.
     """
+    if isinstance(path, Volume):
+        warnings.warn(
+            "write_volume(path, volume) is the order now, as of all writers", DeprecationWarning, stacklevel=2
+        )
+        path, volume = volume, path  # type: ignore[unreachable]
     path = Path(path)
     writer = {
         ".h5": _write_hdf5,
