@@ -83,7 +83,7 @@ def test_bad_files_are_named(volume, tmp_path):
     with pytest.raises(FileError, match="does not exist"):
         read_volume(tmp_path / "absent.h5")
     (tmp_path / "broken.h5").write_bytes(b"nothing of the kind")
-    with pytest.raises(FileError, match="no readable volume"):
+    with pytest.raises(FileError, match="no readable HDF5 file"):
         read_volume(tmp_path / "broken.h5")
     path = write_volume(tmp_path / "other.h5", volume)
     with h5py.File(path, "a") as file:
@@ -92,7 +92,7 @@ def test_bad_files_are_named(volume, tmp_path):
         read_volume(path)
     whole = write_volume(tmp_path / "cut.nrrd", volume).read_bytes()
     (tmp_path / "cut.nrrd").write_bytes(whole[:-40])
-    with pytest.raises(FileError, match="no readable volume"):
+    with pytest.raises(FileError, match="no readable HDF5 file"):
         read_volume(tmp_path / "cut.nrrd")
 
 
