@@ -2,26 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tomopose.cli.common import (
-    OK,
-    DarkOption,
-    DaskOption,
-    DatasetOption,
-    FlatOption,
-    ForceOption,
-    JsonOption,
-    QuietOption,
-    RawOption,
-    RowsOption,
-    Say,
-    ScannerOption,
-    WorkersOption,
-)
+from tomopose.cli.common import OK, DaskOption, ScannerOption, WorkersOption
+from tomopose.cli.options import ImageFileOptions, WritingOptions, add_command
 
 if TYPE_CHECKING:
     from tomopose import ImageSequence, PoseSequence
@@ -34,41 +22,39 @@ EPILOG = (
 
 
 def register(app: typer.Typer) -> None:
-    app.command("detect", epilog=EPILOG)(detect)
+    add_command(app, "detect", detect, epilog=EPILOG)
 
 
-def detect(
-    scanner: ScannerOption,
-    images: Annotated[str, typer.Option("--images", help="Folder, glob or multi-page file of radiographs.")],
-    out: Annotated[Path, typer.Option("--out", help="observations.csv to write.")],
+@dataclass(frozen=True, kw_only=True)
+class Options(ImageFileOptions, WritingOptions):
+    """The options of `tomopose detect`."""
+
+    scanner: ScannerOption
+    images: Annotated[str, typer.Option("--images", help="Folder, glob or multi-page file of radiographs.")]
+    out: Annotated[Path, typer.Option("--out", help="observations.csv to write.")]
     ball_diameter: Annotated[
         str,
         typer.Option(
             "--ball-diameter-mm",
             help="Nominal diameter of the ball, mm; with several balls in an image ID=MM,ID=MM (ids of --poses).",
         ),
-    ],
+    ]
     poses: Annotated[
         Path | None, typer.Option("--poses", help="poses.csv; gives the pose ids. Without it: the images' names.")
-    ] = None,
+    ] = None
     predicted: Annotated[
         Path | None,
         typer.Option("--predicted", help="Table like observations.csv: where each pose's ball should be."),
-    ] = None,
-    dark: DarkOption = None,
-    flat: FlatOption = None,
-    dataset: DatasetOption = None,
-    rows: RowsOption = None,
-    raw: RawOption = None,
-    workers: WorkersOption = 1,
-    dask: DaskOption = None,
+    ] = None
+    workers: WorkersOption = 1
+    dask: DaskOption = None
     resume: Annotated[
-        Path | None, typer.Option("--resume", help="Journal of finished images: go on where a run was interrupted.")
-    ] = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> int:
+        Path | None,
+        typer.Option("--resume", help="Journal of finished images: continue where a run was interrupted."),
+    ] = None
+
+
+def detect(options: Options) -> int:
     """Find the projection of the ball's centre in each radiograph, with its uncertainty.
 
     An image that cannot be measured is listed with the reason, never silently measured.
@@ -77,36 +63,36 @@ def detect(
     from tomopose.cli.job import executor_of, image_source, note_missing_flat, observe, open_for
     from tomopose.files import require_absent
 
-    say = Say(json=as_json, quiet=quiet)
-    require_absent(out, force=force)
-    geometry = tp.read_scanner(scanner)
-    sequence = None if poses is None else tp.read_poses(poses)
-    stack = open_for(
-        say, image_source(images), geometry, sequence, dark=dark, flat=flat, dataset=dataset, rows=rows, raw=raw
-    )
-    note_missing_flat(say, flat)
-    sizes = diameters(ball_diameter)
+    o = options
+    require_absent(o.out, force=o.force)
+    scanner = tp.read_scanner(o.scanner)
+    poses = None if o.poses is None else tp.read_poses(o.poses)
+    read = {"dark": o.dark, "flat": o.flat, "dataset": o.dataset, "rows": o.rows, "raw": o.raw}
+    stack = open_for(o.say, image_source(o.images), scanner, poses, **read)
+    note_missing_flat(o.say, o.flat)
+    sizes = diameters(o.ball_diameter)
     several = isinstance(sizes, dict)
-    if several and sequence is None:
+    if several and poses is None:
         raise typer.BadParameter("several balls need --poses with a row for each image and ball", param_hint="--poses")
-    with executor_of(dask) as executor:
+    with executor_of(o.dask) as executor:
         found = observe(
-            say,
-            geometry,
+            o.say,
+            scanner,
             stack,
-            sequence,
+            poses,
             ball_diameter=sizes,
-            ball_id=sequence.ball_id if several and sequence is not None else None,
-            predicted=None if predicted is None else places(predicted, stack, sequence),
-            workers=workers,
+            ball_id=poses.ball_id if several and poses is not None else None,
+            predicted=None if o.predicted is None else places(o.predicted, stack, poses),
+            workers=o.workers,
             executor=executor,
-            journal=resume,
+            journal=o.resume,
         )
-    tp.write_observations(out, found, force=force)
+    tp.write_observations(o.out, found, force=o.force)
     missed = {i: s for i, s, seen in zip(found.pose_id, found.status or (), found.seen, strict=True) if not seen}
-    say.result(
-        {"out": out.name, "images": len(found), "measured": int(found.seen.sum()), "not_measured": missed},
-        [f"{out}: {int(found.seen.sum())} of {len(found)} balls measured", *(f"  {k}: {v}" for k, v in missed.items())],
+    measured = int(found.seen.sum())
+    o.say.result(
+        {"out": o.out.name, "images": len(found), "measured": measured, "not_measured": missed},
+        [f"{o.out}: {measured} of {len(found)} balls measured", *(f"  {k}: {v}" for k, v in missed.items())],
     )
     return OK
 

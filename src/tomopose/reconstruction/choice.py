@@ -25,7 +25,8 @@ views 0.42 to 0.46 and 8 %, 8 views 0.94 and 18 %; SART leaves 0.10.
 """
 ENOUGH_FOR_FDK = 36
 """Views from which FDK alone is the default on a smooth full turn: its densities are then right to 0.3 %, those of
-FDK with a sweep of SART to 2 %, centres of balls to 0.009 and 0.005 voxel (same scans).  Flat from 30 to 72."""
+FDK with a sweep of SART to 2 %, centres of balls to 0.009 and 0.005 voxel.  Chosen from scans of 24, 36, 48, 72 and
+120 views (same object); not tuned finer."""
 PROBED, STRIP, BLOCK = 16, 3, 8
 """Views whose rims are looked at; columns and rows over which line integrals are averaged there."""
 AIR = 0.05

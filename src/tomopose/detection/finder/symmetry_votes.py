@@ -50,6 +50,15 @@ def _gradient_square(image):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def _vote_along(out, band, i, j, du, dv):  # type: ignore[no-untyped-def]
+    """The votes of an edge at (i, j) for the centres of a band's radii in the direction (du, dv)."""
+    for radius in range(math.ceil(BANDS[band][0]), int(BANDS[band][1]) + 1):
+        x, y = round(i + radius * du), round(j + radius * dv)
+        if 0 <= x < out.shape[1] and 0 <= y < out.shape[0]:
+            out[y, x] += 1.0 / (2.0 * math.pi * radius)
+
+
+@njit(cache=True)
 def _votes(image, square, threshold):  # type: ignore[no-untyped-def]
     """(polarity, band, rows, columns): 1 for a full circle about that centre; polarity 0 is dark inside."""
     rows, columns = image.shape
@@ -67,13 +76,8 @@ def _votes(image, square, threshold):  # type: ignore[no-untyped-def]
             if square[j + dv, i + du] > here or square[j - dv, i - du] >= here:
                 continue
             for band in range(len(BANDS)):
-                for radius in range(math.ceil(BANDS[band][0]), int(BANDS[band][1]) + 1):
-                    weight = 1.0 / (2.0 * math.pi * radius)
-                    for side in range(2):
-                        sign = -1.0 if side == 0 else 1.0
-                        x, y = round(i + sign * radius * gu), round(j + sign * radius * gv)
-                        if 0 <= x < columns and 0 <= y < rows:
-                            out[side, band, y, x] += weight
+                _vote_along(out[0, band], band, i, j, -gu, -gv)
+                _vote_along(out[1, band], band, i, j, gu, gv)
     return out
 
 
@@ -85,9 +89,7 @@ def _peaks(votes, reach, least):  # type: ignore[no-untyped-def]
     for j in range(rows):
         for i in range(columns):
             if votes[j, i] != 0.0:
-                for y in range(max(0, j - reach), min(rows, j + reach + 1)):
-                    for x in range(max(0, i - reach), min(columns, i + reach + 1)):
-                        total[y, x] += votes[j, i]
+                total[max(0, j - reach) : j + reach + 1, max(0, i - reach) : i + reach + 1] += votes[j, i]
     out = np.zeros((PEAKS, 3))
     for j in range(rows):
         for i in range(columns):

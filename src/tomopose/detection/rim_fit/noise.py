@@ -240,10 +240,10 @@ def _lags(grid, reach, margin):  # type: ignore[no-untyped-def]
             here = grid[j, i]
             if np.isnan(here):
                 continue
-            for dv in range(-reach, reach + 1):
-                for du in range(-reach, reach + 1):
-                    there = grid[j + dv, i + du]
-                    if not np.isnan(there):
-                        total[dv + reach, du + reach] += here * there
-                        count[dv + reach, du + reach] += 1.0
+            for k in range(size * size):
+                dv, du = k // size, k % size
+                there = grid[j + dv - reach, i + du - reach]
+                if not np.isnan(there):
+                    total[dv, du] += here * there
+                    count[dv, du] += 1.0
     return total, count

@@ -27,31 +27,25 @@ SCALES: Mapping[str, tuple[float, str]] = {
 }
 
 
-def comparison_report(
-    comparison: Comparison, *, labels: tuple[str, str] = ("A", "B"), title: str = "Two calibrations compared"
-) -> str:
-    """One offline HTML document about the change from one calibration to another: the questions of the paper's table 2.
+COMPARED_UNITS = {"w": "rad", "t": "mm"}
 
-    labels: names of the two calibrations.
-    """
-    units = {"w": "rad", "t": "mm"}
+
+def compared_rows(comparison: Comparison) -> list[list[str]]:
+    """One row a coordinate: name, meaning, change with u, U, ratio and probability."""
+    columns = (comparison.names, comparison.difference, comparison.u, comparison.z, comparison.p)
     rows = []
-    for name, d, u, z, p in zip(
-        comparison.names, comparison.difference, comparison.u, comparison.z, comparison.p, strict=True
-    ):
-        unit = units.get(name.split("_")[0].split("[")[0], "")
-        rows.append(
-            [
-                name,
-                meaning(name),
-                signed(d, unit),
-                small_unit(u, unit),
-                small_unit(expanded_k2(u), unit),
-                f"{z:+.2f}",
-                "–" if np.isnan(p) else probability(p),
-            ]
-        )
-    figure = Figure(
+    for name, d, u, z, p in zip(*columns, strict=True):
+        unit = COMPARED_UNITS.get(name.split("_")[0].split("[")[0], "")
+        chance = "–" if np.isnan(p) else probability(p)
+        change = [signed(d, unit), small_unit(u, unit), small_unit(expanded_k2(u), unit), f"{z:+.2f}", chance]
+        rows.append([name, meaning(name), *change])
+    return rows
+
+
+def compared_figure(comparison: Comparison) -> Figure:
+    """Each change in units of its standard uncertainty."""
+    line = {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "line": {"color": SOFT, "dash": "dash", "width": 1}}
+    return Figure(
         title="Changes in units of their standard uncertainty",
         meaning="Each change divided by its standard uncertainty; the dashed lines are ±2.",
         look_for="Most bars should end between the lines; t_HT and t may leave them together, and cancel in the scan.",
@@ -68,26 +62,24 @@ def comparison_report(
             xaxis=axis(type="category"),
             yaxis=axis("change / u"),
             bargap=0.5,
-            shapes=[
-                {
-                    "type": "line",
-                    "xref": "paper",
-                    "x0": 0,
-                    "x1": 1,
-                    "y0": y,
-                    "y1": y,
-                    "line": {"color": SOFT, "dash": "dash", "width": 1},
-                }
-                for y in (-K2, K2)
-            ],
+            shapes=[{**line, "y0": y, "y1": y} for y in (-K2, K2)],
         ),
         height=330,
     )
+
+
+def comparison_report(
+    comparison: Comparison, *, labels: tuple[str, str] = ("A", "B"), title: str = "Two calibrations compared"
+) -> str:
+    """One offline HTML document about the change from one calibration to another: the questions of the paper's table 2.
+
+    labels: names of the two calibrations.
+    """
     table = Table(
         title="Changes",
         meaning=f"{labels[1]} minus {labels[0]}, the two taken as independent.",
         columns=["coordinate", "what it is", "change", "u", "U (k = 2)", "change / u", "probability by chance"],
-        rows=rows,
+        rows=compared_rows(comparison),
         numeric=(2, 3, 4, 5, 6),
     )
     verdict = Verdict(
@@ -105,7 +97,7 @@ def comparison_report(
             title=title,
             subtitle=f"{labels[0]} → {labels[1]}",
             verdict=verdict,
-            sections=[Section(title="What changed", blocks=[table, figure])],
+            sections=[Section(title="What changed", blocks=[table, compared_figure(comparison)])],
             footer="Written by tomopose.",
         )
     )
