@@ -27,7 +27,7 @@ from tomopose.reconstruction.fdk.path import SourcePath
 from tomopose.units import Array
 
 TAPER = math.radians(10.0)
-"""Over which c rises at the ends of a short scan: ten views of a turn of 360, so that no single view is cut off sharply.
+"""Over which c rises at the ends of a short scan: ten views of 360, so that no single view is cut off sharply.
 Chosen, not tuned."""
 
 
