@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.result import Calibration, Observability, Parameter
+from tomopose.calibration.result import Calibration, Parameter
+from tomopose.calibration.rigid.observability import Observability
 from tomopose.coverage import expanded_k2
 from tomopose.errors import FileError, InputError
 from tomopose.files import read_json, require_absent, warn_if_edited, write_json

@@ -175,6 +175,7 @@ class TwinErrors:
 
 
 Errors: TypeAlias = RigidErrors | IdentifiedErrors | EmpiricalErrors | TwinErrors
+OneMachine: TypeAlias = RigidErrors | IdentifiedErrors | EmpiricalErrors
 
 
 def _hold_one_value_each(errors: MachineErrors | TwinErrors, names: tuple[str, ...]) -> None:
@@ -228,7 +229,7 @@ def _executed(errors: MachineErrors, poses: PoseSequence, moves: PoseSequence) -
     return replace(real, J=J), (*model.names, *worn.names[still.stop :])
 
 
-def require_one_table(errors: Errors) -> RigidErrors | MachineErrors:
+def require_one_table(errors: Errors) -> OneMachine:
     """The errors of a single manipulator; InputError for twins, whose scans have two tables."""
     if isinstance(errors, TwinErrors):
         raise InputError("the calibration is of twin robots, whose scans need two pose tables; use twin_matrices")

@@ -11,9 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tomopose.calibration.model.linear_fit import LinearFit
-from tomopose.units import Array
 
 BLOCKS = 7
 """A seventh of a run is long beside what two neighbours share, and leaves six sevenths to predict from."""
@@ -30,7 +30,7 @@ class HeldOut:
     log_predictive: float
 
 
-def blocks_of(n: int, ball: Array, blocks: int = BLOCKS) -> list[Array]:
+def blocks_of(n: int, ball: NDArray[np.int64], blocks: int = BLOCKS) -> list[NDArray[np.int64]]:
     """Index arrays of at most `blocks` runs of neighbouring poses, such that every ball keeps rows outside each."""
     parts = np.array_split(np.arange(n), min(blocks, n))
     whole = len(np.unique(ball))

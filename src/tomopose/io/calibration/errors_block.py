@@ -88,8 +88,9 @@ def _errors(block: Mapping[str, Any], inverse: bool) -> Errors:
     m = len(block["names"])
     values, u, limits = decode_array(block["values"], m), decode_array(block["u"], m), _range(block["range"])
     if kind == "twin":
-        errors: Errors = _twin(block, values, u, limits, scatter)
-        names: tuple[str, ...] = errors.names
+        twin = _twin(block, values, u, limits, scatter)
+        errors: Errors = twin
+        names = twin.names
     else:
         machine = _machine(kind, block["nominal"])
         lag = block.get("lag")
