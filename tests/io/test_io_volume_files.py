@@ -92,11 +92,11 @@ def test_bad_files_are_named(volume, tmp_path):
         read_volume(path)
     whole = write_volume(tmp_path / "cut.nrrd", volume).read_bytes()
     (tmp_path / "cut.nrrd").write_bytes(whole[:-40])
-    with pytest.raises(FileError, match="no readable HDF5 file"):
+    with pytest.raises(FileError, match="do not fit its"):
         read_volume(tmp_path / "cut.nrrd")
 
 
 def test_the_earlier_order_of_arguments_is_named_and_still_writes(volume, tmp_path):
     with pytest.warns(DeprecationWarning, match=r"write_volume\(path, volume\) is the order now"):
         path = write_volume(volume, tmp_path / "v.h5")
-    assert read_volume(path).grid == volume.grid
+    assert read_volume(path).grid.same_as(volume.grid)

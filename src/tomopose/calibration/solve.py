@@ -21,12 +21,13 @@ from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import (
     UNITS,
     FreeParameters,
+    ImpossibleScannerError,
     adjusted_scanners,
     base_name,
     free_parameters,
     translation_scale,
 )
-from tomopose.calibration.model.problem import pair
+from tomopose.calibration.model.problem import Problem, pair
 from tomopose.calibration.model.unseen import Unseen, unseen_columns, unseen_gain, unseen_names
 from tomopose.calibration.result import Arrangement, Calibration, PoseNoiseFound
 from tomopose.calibration.rigid.contradiction import NOTHING_FITS, Contradicted, contradicted
@@ -292,6 +293,19 @@ def maker_of(manipulator: Any, stated: Repeatability | None) -> Repeatability | 
     return None if machine is None else machine.repeatability
 
 
+def _by_assumed(
+    problem: Problem, freed: FreeParameters, *, robust: bool, auto: bool
+) -> tuple[Solution, FreeParameters, tuple[Contradicted, ...]]:
+    """(solution, what is freed, what the images contradict) with the stated and assumed standard deviations."""
+    stated = solve(problem, freed, robust=robust)
+    if not auto:
+        return stated, freed, ()
+    freed, against = contradicted(stated.used, freed, stated.fit)
+    if against:
+        stated = solve(problem, freed, robust=robust, start=stated.fit)
+    return stated, freed, against
+
+
 def rigid_calibration(
     scanner: Scanner | Sequence[Scanner],
     poses: PoseSequence | Sequence[PoseSequence],
@@ -317,12 +331,13 @@ def rigid_calibration(
     )
     problem = replace(plain, scanners=tuple(with_assumed(s, a) for s, a in zip(plain.scanners, assumed, strict=True)))
     freed = free_parameters(problem.scanners, free=free, fix=fix, priors=priors)
-    stated = solve(problem, freed, robust=robust)
-    against: tuple[Contradicted, ...] = ()
-    if auto:
-        freed, against = contradicted(stated.used, freed, stated.fit)
-        if against:
-            stated = solve(problem, freed, robust=robust, start=stated.fit)
+    try:
+        stated, freed, against = _by_assumed(problem, freed, robust=robust, auto=auto)
+    except ImpossibleScannerError:
+        # Something else is wrong, such as a convention: with the scanner as declared it shows.
+        problem = replace(plain, scanners=tuple(replace(s, sigma={}) for s in plain.scanners))
+        freed, against = free_parameters(problem.scanners, free=free, fix=fix), ()
+        stated = solve(problem, freed, robust=robust)
     solution = with_pose_noise(stated, pose_noise, robust=robust, maker=maker)
     diagnosis = None
     if hypotheses:

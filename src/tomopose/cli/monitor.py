@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -63,7 +64,7 @@ def monitor(options: Options) -> int:
     o = options
     if o.add is None and (o.label or o.machine):
         raise typer.BadParameter("--label and --machine describe the calibration that --add names", param_hint="--add")
-    known = read_history(o.history) if o.add is None or o.history.exists() else []
+    known: Sequence[Mapping[str, Any]] = read_history(o.history) if o.add is None or o.history.exists() else []
     entries = known
     if o.add is not None:
         entry = history_entry(tp.read_calibration(o.add), label=o.label, machine=o.machine)

@@ -10,7 +10,7 @@ import json
 import math
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import h5py
 import numpy as np
@@ -40,7 +40,7 @@ def write_volume(path: str | Path, volume: Volume, *, force: bool = False) -> Pa
         warnings.warn(
             "write_volume(path, volume) is the order now, as of all writers", DeprecationWarning, stacklevel=2
         )
-        path, volume = volume, path  # type: ignore[unreachable]
+        path, volume = cast(str | Path, volume), cast(Volume, path)
     path = Path(path)
     writer = {
         ".h5": _write_hdf5,

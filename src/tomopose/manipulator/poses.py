@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -19,6 +19,8 @@ from tomopose.units import Array, float_array, rows_at
 from tomopose.values import Column, Rows, value
 
 PIVOT_TOLERANCE_MM = 1e-6
+AT_ZERO = float_array(())
+"""The table angles of a sequence for which none are given: 0 for every pose."""
 
 
 @value
@@ -42,7 +44,7 @@ class PoseSequence(Rows):
 
     T_MH: RigidTransform
     pose_id: tuple[str, ...]
-    alpha: Array | None = None
+    alpha: Array = field(default_factory=lambda: AT_ZERO)
     ball_id: Any = None
     image: tuple[str, ...] | None = None
     time_utc: tuple[str, ...] | None = None
@@ -64,7 +66,7 @@ class PoseSequence(Rows):
         if twice:
             raise InputError(f"pose_id {twice[0]!r} appears more than once ({len(twice)} ids repeat); ids must differ")
         object.__setattr__(self, "pose_id", ids)
-        alpha = np.zeros(n) if self.alpha is None else np.asarray(self.alpha, dtype=np.float64)
+        alpha = np.zeros(n) if self.alpha is None or self.alpha is AT_ZERO else np.asarray(self.alpha, dtype=np.float64)
         ball_id = np.zeros(n, dtype=np.int64) if self.ball_id is None else np.array(self.ball_id, dtype=np.int64)
         for name, array in (("alpha", alpha), ("ball_id", ball_id)):
             if array.shape != (n,):
@@ -145,7 +147,7 @@ class PoseSequence(Rows):
             self,
             T_MH=self.T_MH[i],
             pose_id=tuple(self.pose_id[k] for k in i),
-            alpha=self.alpha[i] if self.alpha is not None else None,
+            alpha=self.alpha[i],
             ball_id=self.ball_id[i],
             image=of(self.image),
             time_utc=of(self.time_utc),

@@ -73,17 +73,18 @@ def measured_ball_size(problem: Problem, P: Array, centres: Array) -> BallSize |
 
     P (n, 3, 4): from the balls' frame to pixels;  centres (n, 3): of the ball of each row.
     """
-    if problem.outline is None or problem.ball_diameter is None:
+    outline, diameter = problem.outline, problem.ball_diameter
+    if outline is None or diameter is None:
         return None
-    known = np.isfinite(problem.outline)
+    known = np.isfinite(outline)
     if not known.any():
         return None
 
     def ratio(factor: float) -> float:
         # a scene in another unit throws the silhouettes of a ball that is smaller by this factor
-        calculated = silhouette_outlines(P[known], centres[known], problem.ball_diameter / factor)
+        calculated = silhouette_outlines(P[known], centres[known], diameter / factor)
         with np.errstate(divide="ignore"):
-            return float(np.sqrt(np.median(problem.outline[known] / calculated)))
+            return float(np.sqrt(np.median(outline[known] / calculated)))
 
     own = ratio(1.0)
     agreeing = (u for u in POSITION_UNITS if abs(ratio(u[2]) - 1.0) < UNIT_TOLERANCE)

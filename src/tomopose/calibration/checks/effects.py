@@ -189,6 +189,11 @@ def rotation_scale_columns(b: ProjectionBlocks, origin: Array) -> Array:
     return by_turn * w[:, None, :]
 
 
+def _scale_words(c: str) -> Words:
+    """The words of a translation scale along the axis c."""
+    return lambda size, px, at: f"the manipulator's {c} has the translation scale 1 {float(size[0]):+.2g}"
+
+
 def _manipulator(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
     t = problem.t_MH
     found = [
@@ -197,9 +202,7 @@ def _manipulator(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
                 name=f"scale of {c}",
                 kind="manipulator",
                 short=f"translation scale of {c}",
-                words=lambda size, px, at, c=c: (
-                    f"the manipulator's {c} has the translation scale 1 {float(size[0]):+.2g}"
-                ),
+                words=_scale_words(c),
             ),
             C=_white(problem, (b.G_H[:, :, i] * t[:, i, None])[:, :, None]),
         )

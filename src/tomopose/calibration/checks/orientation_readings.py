@@ -198,7 +198,7 @@ def _sign_changes() -> list[Alternative]:
     found = []
     for s in sets:
         names = "".join(SIGNED[i] for i in s)
-        signs = tuple(-1 if i in s else 1 for i in range(3))
+        signs = (-1 if 0 in s else 1, -1 if 1 in s else 1, -1 if 2 in s else 1)
         found.append(
             Alternative(
                 name=f"sign of {names}",

@@ -32,7 +32,7 @@ def budget_words(budget: ScanBudget, assumed: tuple[Assumed, ...]) -> str:
     assumed). Two table angles would make it 0.001 px."."""
     words = f"a tilted scan carries {budget.total:.2g} px of standard uncertainty, as a volume sees it"
     known = {a.name: a for a in assumed}
-    parts = []
+    parts: list[str] = []
     for name, px in budget.shares:
         if px**2 < NAMED * budget.total**2 or len(parts) == MOST_NAMED:
             break

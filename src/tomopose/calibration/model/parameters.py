@@ -143,6 +143,10 @@ def free_parameters(
     )
 
 
+class ImpossibleScannerError(InputError):
+    """A fit moved freed scanner values to where no scanner is: they cannot explain the data."""
+
+
 def adjusted_scanners(scanners: tuple[Scanner, ...], free: FreeParameters, delta: Array) -> tuple[Scanner, ...]:
     """The scanners with the deviations delta (f,) applied.  translation_scale is not part of a scanner."""
     result = []
@@ -152,7 +156,10 @@ def adjusted_scanners(scanners: tuple[Scanner, ...], free: FreeParameters, delta
             name = SCANNER_COLUMNS[free.cols[j]]
             if free.col_run[j] in (-1, r) and name != "translation_scale":
                 change[name] = change.get(name, getattr(scanner, name)) + free.factor[j] * delta[j]
-        result.append(replace(scanner, **change) if change else scanner)
+        try:
+            result.append(replace(scanner, **change) if change else scanner)
+        except InputError as error:
+            raise ImpossibleScannerError(f"the fit ended at a scanner that cannot be: {error}") from error
     return tuple(result)
 
 

@@ -145,7 +145,8 @@ def estimate_pose_noise(
     arrays = tuple(np.ascontiguousarray(v) for v in (covariance, A, B, J * scale, r, known * scale**2, pull * scale))
 
     def objective(s_t: float, s_w: float) -> float:
-        return float(_minus_2_log_likelihood(*arrays, s_t, s_w))
+        C, a, c, J_s, r_k, known_s, pull_s = arrays
+        return float(_minus_2_log_likelihood(C, a, c, J_s, r_k, known_s, pull_s, s_t, s_w))
 
     noise = float(np.mean(np.trace(covariance, axis1=1, axis2=2)))
     # the largest scatter that is tried: the whole of the residuals, four times over

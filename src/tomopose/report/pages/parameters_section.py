@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tomopose.calibration.result import Assumed, Calibration, Parameter
+from tomopose.calibration.model.assumed import Assumed
+from tomopose.calibration.result import Calibration, Parameter
 from tomopose.coverage import expanded_k2
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.error_models import RigidErrors, TwinErrors

@@ -86,11 +86,11 @@ def _corners(
 
 
 class Touched(NamedTuple):
-    """The triangles that touch each rough pixel: lists[start[j, i]] and the next count[j, i] - 1; see `touching`."""
+    """The triangles that touch each rough pixel: lists[start[j, i]] and the next number[j, i] - 1; see `touching`."""
 
     rough: np.ndarray
     start: np.ndarray
-    count: np.ndarray
+    number: np.ndarray
     lists: np.ndarray
 
 
@@ -144,11 +144,11 @@ def _rough_cells(
     Q, L, M = np.empty(len(work.L)), np.empty(len(work.L)), np.empty(HELD)
     most = 1
     for j in range(j_0, j_1):
-        most = max(most, touched.count[j].max())
+        most = max(most, touched.number[j].max())
     near = Gathered(np.empty((most, 3, 6)), np.empty((most, 11)), np.empty(most, dtype=np.int64), P[6])
     for j, i in np.argwhere(touched.rough[j_0:j_1]):
         j += j_0
-        k, first = touched.count[j, i], touched.start[j, i]
+        k, first = touched.number[j, i], touched.start[j, i]
         gather(P, touched.lists[first : first + k], near.edges, near.planes, near.columns)
         f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
         off, bump = 0.0, 0.0
@@ -216,7 +216,7 @@ def add_mesh_transmission(
     lists = np.empty(int(count.sum()), dtype=np.int64)
     count[:] = 0
     in_bands(lambda lo, hi: touching(P, rough, lo, hi, count, start, lists), n_v, threads)
-    touched = Touched(rough=rough, start=start, count=count, lists=lists)
+    touched = Touched(rough=rough, start=start, number=count, lists=lists)
     in_bands(
         lambda lo, hi: _rough_cells(c, depth, P, u_0, v_0, I, touched, f, weight, lo, hi, out),
         n_v,

@@ -106,8 +106,8 @@ def _measure_chunk(run: BallRun, progress: Progress) -> dict[str, Any]:
         images,
         run.scanner,
         ball_diameter=BALL_DIAMETER,
-        origin=np.array(origins),
-        pose_id=run.poses.pose_id,  # type: ignore[arg-type]
+        origin=origins,
+        pose_id=run.poses.pose_id,
     )
     return {
         "by_ellipse": by_ellipse,

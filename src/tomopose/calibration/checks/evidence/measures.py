@@ -78,10 +78,11 @@ def alternatives(e: Evidence, much: bool) -> Iterator[Found]:
 
 
 def other_unit(e: Evidence, limit: float) -> Iterator[Found]:
-    h = e.diagnosis.other_unit if e.diagnosis else None
+    diagnosis = e.diagnosis
+    h = diagnosis.other_unit if diagnosis else None
     gauged = e.ball_size is not None and abs(e.ball_size.ratio - 1.0) < limit
-    if h is not None and not gauged:
-        yield Found(value=h.length_factor, words=other_unit_words(h, e.diagnosis.declared), remedy=h.remedy)
+    if diagnosis and h is not None and not gauged:
+        yield Found(value=h.length_factor, words=other_unit_words(h, diagnosis.declared), remedy=h.remedy)
 
 
 def no_place(e: Evidence, limit: float) -> Iterator[Found]:
