@@ -161,11 +161,16 @@ def test_changed_pivot_is_named(size: float) -> None:
     p = size * rng.standard_normal(42) * exact.sigma
     T_HT = RigidTransform.from_angles([0.0, 0.0, np.pi], [1.0, 2.0, 1.0], source=Frame.H, target=Frame.T)
     run = experiment(exact, p, executed, e.scan, T_HT=T_HT, balls=[[12.0, -14.0, 10.0]], rng=rng)
-    rigid = calibrate(SCANNER, e.poses, run.observations, model="rigid", hypotheses=False)
-    cal = calibrate_kinematic(SCANNER, e.poses, run.observations, rigid=rigid, manipulator=HEXAPOD)
+    rigid = calibrate(SCANNER.exact(), e.poses, run.observations, model="rigid", hypotheses=False)
+    cal = calibrate_kinematic(SCANNER.exact(), e.poses, run.observations, rigid=rigid, manipulator=HEXAPOD)
+    assert cal.verdict == "doubtful"
+    if size == 0.0:
+        # Trusted poses are the better model of an exact machine; its list of effects has no change of the pivot, and
+        # names a wobble and steps instead.
+        assert any(f.rule == "changed during the run" for f in cal.checks)
+        return
     (step,) = (f for f in cal.checks if f.rule == "step")
     assert step.verdict == "doubtful"
-    assert cal.verdict != "trustworthy"
     assert re.search(r"the pivot of the controller changed at pose 100 by \(0\.[23]", step.words)
 
 

@@ -303,7 +303,8 @@ def test_residuals_by_axis_before_and_after() -> None:
 
 def test_freed_scanner_parameters_are_solved_along() -> None:
     e = hexapod_experiment(HEXAPOD, "mixed", 4)
-    off = replace(e.scanner, u_0=e.scanner.u_0 + 0.8, d_SR=e.scanner.d_SR + 0.05, sigma={"u_0": 1.0, "d_SR": 0.1})
+    stated = {**e.scanner.exact().sigma, "u_0": 1.0, "d_SR": 0.1}
+    off = replace(e.scanner, u_0=e.scanner.u_0 + 0.8, d_SR=e.scanner.d_SR + 0.05, sigma=stated)
     rigid = calibrate(off, e.poses, e.observations, model="rigid", hypotheses=False)
     cal = calibrate_kinematic(off, e.poses, e.observations, rigid=rigid, manipulator=HEXAPOD, model="kinematic")
     u = {p.name: p.u for p in cal.parameters}

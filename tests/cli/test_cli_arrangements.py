@@ -80,7 +80,7 @@ def gantry(tmp_path, scanner, rng):
     real = tp.inverse_poses(real_motion(machine, poses, p, disturbance=Disturbance(), rng=rng))
     x = project_ball(scanner, T_HT=mount, T_MH=real.T_MH, t=balls[np.asarray(poses.ball_id)])
     x = x + SIGMA * rng.standard_normal(x.shape)
-    tp.write_scanner(tmp_path / "scanner.json", scanner)
+    tp.write_scanner(tmp_path / "scanner.json", scanner.exact())
     tp.write_poses(tmp_path / "poses.csv", poses)
     tp.write_poses(tmp_path / "scan.csv", scan)
     tp.write_observations(tmp_path / "o.csv", tp.BallObservations.from_sigma(x, SIGMA, pose_id=poses.pose_id))
@@ -293,7 +293,7 @@ def twins(tmp_path, monkeypatch):
 
     e = twin_experiment(typical_robot(), 1)
     scanner = e.scanner
-    tp.write_scanner(tmp_path / "scanner.json", scanner)
+    tp.write_scanner(tmp_path / "scanner.json", scanner.exact())
     for name, table in (
         ("poses", e.poses),
         ("source", e.twin.source_poses),

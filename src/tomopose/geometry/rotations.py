@@ -70,7 +70,7 @@ def angles_from_rotation(R: Array) -> Array:
 
 def exp_rotation(w: Array) -> Array:
     """Rotation matrices from rotation vectors (..., 3), rad."""
-    w = np.asarray(w, dtype=np.float64)
+    w = np.array(w, dtype=np.float64)  # SciPy takes no read-only array
     return Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix().reshape(*w.shape[:-1], 3, 3)
 
 

@@ -89,7 +89,7 @@ def measured_ball_size(problem: Problem, P: Array, centres: Array) -> BallSize |
     own = ratio(1.0)
     agreeing = (u for u in POSITION_UNITS if abs(ratio(u[2]) - 1.0) < UNIT_TOLERANCE)
     unit = None if abs(own - 1.0) <= WRONG else next(agreeing, None)
-    return BallSize(ratio=own, diameter=problem.ball_diameter, unit=unit)
+    return BallSize(ratio=own, diameter=diameter, unit=unit)
 
 
 def size_ratio(calibration: Placed, poses: PoseSequence, observations: BallObservations, ball_diameter: float) -> float:

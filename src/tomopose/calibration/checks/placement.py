@@ -12,9 +12,9 @@ from tomopose.calibration.rigid.fit import Fit
 from tomopose.errors import InputError
 from tomopose.units import Array
 
-OUTSIDE = 0.5
+OUTSIDE = 1.0
 """Of the panel's larger side.  A simulated or predicted table may reach beyond the panel and is right all the same;
-other units, another binning or another scanner put centres farther away than half a panel."""
+other units, another binning or another scanner put centres farther away than a whole panel."""
 
 
 @dataclass(frozen=True, kw_only=True)
