@@ -124,7 +124,7 @@ def test_eq_8_divides_by_the_number_of_poses(scanner, T_HT, rng):
     poses = PoseSequence.from_table(positions, angles)
     x_D = project_ball(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=[3.0, -2.0, 8.0]) + rng.normal(scale=0.02, size=(20, 2))
     calibration = calibrate(scanner, poses, BallObservations.from_sigma(x_D, 0.02), hypotheses=False)
-    calculated = project_ball(scanner, T_HT=calibration.T_HT, T_MH=poses.T_MH, t=calibration.t)
+    calculated = project_ball(calibration.scanner, T_HT=calibration.T_HT, T_MH=poses.T_MH, t=calibration.t)
     d = np.sqrt(((x_D - calculated) ** 2).sum(axis=1))
     assert_allclose(calibration.d, d, atol=1e-9)
     assert_allclose(calibration.d_rms, np.sqrt((d**2).sum() / 20), rtol=1e-9)

@@ -11,12 +11,16 @@ from .calibration.checks.alternative import Alternative as Alternative
 from .calibration.checks.convention_tests import Diagnosis as Diagnosis
 from .calibration.checks.convention_tests import Hypothesis as Hypothesis
 from .calibration.checks.convention_tests import diagnose as diagnose
+from .calibration.checks.scanner_tests import Explanation as Explanation
 from .calibration.checks.stability import Effect as Effect
 from .calibration.checks.stability import OutlierBlock as OutlierBlock
 from .calibration.checks.stability import RepeatedPose as RepeatedPose
 from .calibration.checks.stability import Stability as Stability
 from .calibration.checks.verdict import Finding as Finding
+from .calibration.model.assumed import Assumed as Assumed
+from .calibration.model.budget import ScanBudget as ScanBudget
 from .calibration.model.problem import Problem as Problem
+from .calibration.model.unseen import Unseen as Unseen
 from .calibration.projection_matrices import projection_matrices as projection_matrices
 from .calibration.records.charts import ControlChart as ControlChart
 from .calibration.records.charts import control_chart as control_chart
@@ -32,14 +36,26 @@ from .calibration.result import Parameter as Parameter
 from .calibration.result import PoseNoiseFound as PoseNoiseFound
 from .calibration.result import RotationResiduals as RotationResiduals
 from .calibration.result import ViewDistances as ViewDistances
+from .calibration.rigid.contradiction import Contradicted as Contradicted
 from .calibration.rigid.observability import Observability as Observability
 from .calibration.solve import calibrate as calibrate
 from .calibration.uncertainty.monte_carlo import MonteCarlo as MonteCarlo
 from .calibration.uncertainty.monte_carlo import monte_carlo as monte_carlo
 from .detection.finder.find import Candidate as Candidate
 from .detection.image import detect_image as detect_image
+from .detection.reading import Radiograph as Radiograph
 from .detection.result import BallImage as BallImage
 from .detection.run.detect import detect as detect
+from .detection.settings import DetectionSettings as DetectionSettings
+from .detection.settings import FinderSettings as FinderSettings
+from .detection.settings import FitSettings as FitSettings
+from .detection.settings import FlagSettings as FlagSettings
+from .detection.settings import NoiseSettings as NoiseSettings
+from .detection.settings import RaySettings as RaySettings
+from .detection.settings import RingSettings as RingSettings
+from .detection.settings import RingTestSettings as RingTestSettings
+from .detection.settings import RunSettings as RunSettings
+from .detection.settings import SectorTestSettings as SectorTestSettings
 from .engines.objects import to_astra as to_astra
 from .engines.objects import to_cil as to_cil
 from .engines.objects import to_leap as to_leap
@@ -203,8 +219,3 @@ from .volume import Volume as Volume
 from .volume import VoxelGrid as VoxelGrid
 
 __version__: str
-from .calibration.checks.scanner_tests import Explanation as Explanation
-from .calibration.model.assumed import Assumed as Assumed
-from .calibration.model.budget import ScanBudget as ScanBudget
-from .calibration.model.unseen import Unseen as Unseen
-from .calibration.rigid.contradiction import Contradicted as Contradicted

@@ -71,8 +71,8 @@ def test_values_are_frozen(T_HT):
 @pytest.mark.parametrize(
     ("R", "t", "error", "message"),
     [
-        (np.eye(3) * 2, np.zeros(3), InputError, "no proper rotation"),
-        (np.diag([1, 1, -1.0]), np.zeros(3), InputError, "no proper rotation"),
+        (np.eye(3) * 2, np.zeros(3), InputError, "not a proper rotation"),
+        (np.diag([1, 1, -1.0]), np.zeros(3), InputError, "not a proper rotation"),
         (np.eye(3), np.array([0, np.nan, 0]), InputError, "not finite"),
         (np.eye(4), np.zeros(3), ShapeError, "needs R"),
         (np.stack([np.eye(3)] * 2), np.zeros((3, 3)), ShapeError, "needs R"),
