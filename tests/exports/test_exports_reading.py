@@ -439,7 +439,7 @@ def test_rtk_stacks_that_run_from_the_top(bare, matrices):
         (lambda s: s.pop("spacing"), "does not hold p_u; give p_u"),
         (lambda s: s.pop("size"), "does not hold n_u; give n_u"),
         (lambda s: s.update(direction=[-1, 1]), "neither"),
-        (lambda s: s.update(world_to_rtk=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]), "not a proper rotation"),
+        (lambda s: s.update(world_to_rtk=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]), "no proper rotation"),
         (lambda s: s.update(origin=[0, "left"]), "origin of the RTK side file"),
     ],
 )
