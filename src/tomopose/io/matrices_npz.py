@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from tomopose.errors import FileError, InputError, SchemaVersionError
-from tomopose.files import SCHEMA, atomic_file, require_absent, warn_edited
+from tomopose.files import DIGEST, SCHEMA, atomic_file, require_absent, warn_edited
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.io.scanner_json import scanner_document, scanner_from_document
 from tomopose.io.table_text import unknown_column
@@ -22,7 +22,6 @@ from tomopose.reading.contradictions import require_one_handedness, require_same
 
 REQUIRED = ("P", "n_u", "n_v", "p_u", "p_v", "pose_id")
 SIGMA = {"P_points_sigma_px": "points_sigma", "P_points_sigma_shared_px": "points_sigma_shared"}
-DIGEST = "content_sha256"
 KNOWN = ("schema", *REQUIRED, *SIGMA, "in_front_mm", "scanner", "provenance", DIGEST)
 
 
