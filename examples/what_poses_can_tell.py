@@ -2,7 +2,7 @@
 
     python examples/what_poses_can_tell.py
 
-The residual is the same for both plans. What differs is what they can tell.
+The residual is the same for both plans. What differs is what they can determine.
 """
 
 from __future__ import annotations

@@ -160,7 +160,7 @@ def test_a_damaged_key_starts_anew(tmp_path, text):
         assert not goes_on(tmp_path / "key.json", key_of("state"), what="the state")
 
 
-def test_another_kind_of_work_is_never_gone_on_with():
+def test_another_kind_of_work_is_never_continued():
     assert key_of("a").changes(key_of("b")) == ("it is a b, not a a",)
     assert key_of("a") != key_of("b")
     assert Key.from_json(key_of("a", x=1).to_json()) == key_of("a", x=1)

@@ -63,7 +63,7 @@ def overwrite(data: bytearray, rng: random.Random) -> None:
 
 
 def integer(data: bytearray, rng: random.Random) -> None:
-    """A telling whole number where another may be."""
+    """A revealing whole number where another may be."""
     width = rng.choice((1, 2, 4, 8))
     place = rng.randrange(max(len(data) - width, 1))
     value = rng.choice(INTEGERS) & ((1 << 8 * width) - 1)

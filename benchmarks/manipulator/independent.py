@@ -51,7 +51,7 @@ class Platform:
         self.offset = size * rng.normal(0, SIGMA_JOINT, 6)
 
     def reached(self, t: Any, angles: Any, scatter: bool) -> tuple[Any, Any]:
-        """Where the real plate stands when told (t mm, angles deg)."""
+        """Where the real plate is for a commanded pose (t mm, angles deg)."""
         R = Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()
         legs = np.linalg.norm(self.platform @ R.T + t - self.base, axis=1) + self.offset
 

@@ -102,7 +102,7 @@ def experiment(
 ) -> Experiment:
     """Image the balls on the real machine, which then executes the scan.
 
-    centre: middle of the object in M, mm, where it is not what stands at the W origin at home (a robot's flange).
+    centre: middle of the object in M, mm, where it is not what is at the W origin at home (a robot's flange).
     """
     disturbance = disturbance or Disturbance()
     real = real_motion(machine, poses, p, disturbance=disturbance, rng=rng)
@@ -207,11 +207,11 @@ def robot_experiment(
 ) -> Experiment:
     """The object hangs on a robot's flange before the source: n poses about its middle, then a tilted turn.
 
-    table: the robot stands on the rotary table, which takes four angles.
+    table: the robot is mounted on the rotary table, which takes four angles.
     """
     rng = np.random.default_rng(np.random.SeedSequence([6, seed]))
     p = rng.standard_normal(len(robot.names)) * robot.sigma
-    # the base stands behind the source; the middle of the object lies at the W origin
+    # the base is behind the source; the middle of the object lies at the W origin
     T_HT = RigidTransform.from_angles([0.01, -0.02, np.pi - 0.3], np.zeros(3), source=Frame.H, target=Frame.T)
     T_HT = replace(T_HT, t=-(T_HT.R @ X_WORK))
     poses = robot_plan(

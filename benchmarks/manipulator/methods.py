@@ -5,7 +5,7 @@ Usage: python benchmarks/manipulator/methods.py [--seeds 6]
 1.  A worn hexapod (joint errors 0.1 mm, backlash, drift, repeatability) executes the paper's tilted scan.  Its matrices
     come from one ball (189 mixed poses before the scan; rigid and kinematic) or, as in paper ref. [8], from an object
     of six calibrated balls imaged in every view of the scan itself.
-2.  A C-arm: a hexapod of the same errors carries source and detector about a standing ball (150 poses), then scans.
+2.  A C-arm: a hexapod of the same errors carries source and detector about a fixed ball (150 poses), then scans.
 3.  Twin robots (6R, 0.2 mm, 0.02 deg): one carries the source, the other the detector (200 views), then they scan.
 """
 

@@ -1,4 +1,4 @@
-"""Virtual twin robots: one carries the source, the other the detector, about a standing ball and object."""
+"""Virtual twin robots: one carries the source, the other the detector, about a fixed ball and object."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _round(robot: SerialRobot, turn: Any, middle: Any, R: Any, x: Any, arm: Any,
 
 
 def _executed(robot: SerialRobot, table: PoseSequence, p: Any, rng: np.random.Generator) -> PoseSequence:
-    """Where the flange of a robot with errors p really stands, with its repeatability."""
+    """Where the flange of a robot with errors p really is, with its repeatability."""
     real = robot.real_poses(table, p)
     R, t = moved(real.R, real.t, rng.standard_normal((len(table), 6)) * np.sqrt(robot.repeatability.variance))
     return replace(table, T_MH=RigidTransform(R=R, t=t, source=Frame.M, target=Frame.H), q=None)

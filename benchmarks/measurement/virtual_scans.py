@@ -211,7 +211,7 @@ def report(rows, sets):
 
 
 def one_another(rows, objects, repeats=20):
-    """How often scans of other objects, one each, tell the error of a scan: by the rule of `budget`."""
+    """How often scans of other objects, one each, show the error of a scan: by the rule of `budget`."""
     rng = np.random.default_rng(0)
     for name, found in rows.items():
         e = np.array([r.value - truth for r, truth in found]).reshape(objects, -1)

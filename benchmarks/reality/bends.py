@@ -23,7 +23,7 @@ class Data:
 
 @dataclass(frozen=True)
 class Bend:
-    """names: words of which one must stand in the first explanation for the culprit to count as named."""
+    """names: words of which one must appear in the first explanation for the culprit to count as named."""
 
     name: str
     size: str

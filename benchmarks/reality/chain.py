@@ -81,7 +81,7 @@ class Panel:
 @dataclass
 class Table:
     """A rotary table.  encoder: (harmonic, rad amplitude, phase); shift: (harmonic, axis, mm, phase) of its centre;
-    tilt: (harmonic, axis, rad, phase) of its axis; offset (3,) mm and lean (2,) rad: where the real axis stands."""
+    tilt: (harmonic, axis, rad, phase) of its axis; offset (3,) mm and lean (2,) rad: where the real axis is."""
 
     encoder: list[tuple[int, float, float]] = field(default_factory=list)
     shift: list[tuple[int, int, float, float]] = field(default_factory=list)
@@ -142,7 +142,8 @@ def intrinsic_xyz(w: np.ndarray) -> np.ndarray:
 class World:
     """Everything between the plate and the pixels.
 
-    R_HT, t_HT: the mount;  balls (b, 3): in M;  moving: the manipulator carries the scanner, balls stand in its base.
+    R_HT, t_HT: the mount;  balls (b, 3): in M;  moving: the manipulator carries the scanner, balls are fixed in its
+    base.
     slip: (first pose, (3,) mm) of the ball;  bump: (first pose, (3,) rad, (3,) mm) of the mount;
     spot_drift (3,), ball_drift (3,): mm over the run;  image_drift (2,): px over the run.
     """

@@ -109,7 +109,7 @@ def world(kind: str, rng: np.random.Generator) -> tuple[World, np.ndarray]:
     R_HT = small_turn(rng.normal(0, 0.01, 3)) @ turn(2, np.pi)
     t_HT = rng.uniform(-2, 2, 3)
     if kind == "moving":
-        # the object stands 600 mm before the plate's zero; the scanner is seen from the plate
+        # the object is 600 mm before the plate's zero; the scanner is seen from the plate
         return World(R_HT=R_HT, t_HT=t_HT, moving=True), balls
     if kind == "turntable":
         balls = rng.uniform(-12, 12, (4, 3)) + np.array([0, 0, 1.0]) * np.array([[-15.0], [-5.0], [5.0], [15.0]])

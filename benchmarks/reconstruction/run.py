@@ -3,7 +3,7 @@
     python benchmarks/reconstruction/run.py speed accuracy agreement adjoint slabs large [--views 90] [--out F.json]
 
 Peers take turns, view block by view block, so that a busy machine is as unkind to both; process CPU seconds are the
-figure to compare, wall seconds stand beside them.  "2 idle cores" is CPU seconds divided by two.
+figure to compare, wall seconds are beside them.  "2 idle cores" is CPU seconds divided by two.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     python benchmarks/section6/run.py --out OUT --binning 5 4 --views 360 500 --edge 0.35 --runs 1
 
-An interrupted run goes on where it stopped when it is called again with the same folder and numbers.
+An interrupted run continues where it stopped when it is called again with the same folder and numbers.
 """
 
 from __future__ import annotations

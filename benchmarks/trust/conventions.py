@@ -3,7 +3,7 @@
 Every mistake of the list is written into poses.csv or observations.csv of a random calibration (mount, ball, poses,
 noise), and `tomopose diagnose` and `tomopose calibrate` are run on the files.  Two plans: compound rotations at four
 table angles, where all should be named, and the paper's single-axis grid with the table still, where some cannot be
-told apart and must be said to be so.
+distinguished and must be reported as such.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ MISTAKES: dict[str, Mistake] = {
     "pixels counted from 1": lambda f, _: replace(f, x=f.x + 1.0),
     "set poses": _encoder,
 }
-"""The rival of `diagnose` that is the truth -> what was written instead of it."""
+"""The alternative of `diagnose` that is the truth -> what was written instead of it."""
 
 
 def files(rng: np.random.Generator, *, still: bool) -> Files:
@@ -183,7 +183,8 @@ def command(words: list[str]) -> tuple[int, dict[str, Any]]:
 
 
 def judged(name: str, said: dict[str, Any]) -> tuple[str, str]:
-    """(what diagnose says of the true reading, its cure): first | tied with N | not told apart | missed | refused."""
+    """(what diagnose says of the true reading, its remedy): first | tied with N | not distinguished | missed |
+    refused."""
     if "hypotheses" not in said:
         return "refused at reading", said["error"]["message"].split(": ", 1)[1]
     mine = next((h for h in said["hypotheses"] if h["name"] == name), None)
@@ -192,7 +193,7 @@ def judged(name: str, said: dict[str, Any]) -> tuple[str, str]:
     leading = said["leading"]
     if name in leading:
         return ("first" if leading == [name] else f"first or tied, with {len(leading) - 1}"), mine["cure"]
-    return ("not told apart" if not leading and mine["outcome"] == "same" else "missed"), mine["cure"]
+    return ("not distinguished" if not leading and mine["outcome"] == "same" else "missed"), mine["cure"]
 
 
 def cases(folder: Path, *, still: bool, seed: int = 0) -> list[dict[str, Any]]:
@@ -222,12 +223,12 @@ def conventions(folder: Path) -> None:
     for still, plan in ((False, "compound, four table angles"), (True, "paper's grid, table still")):
         rows = cases(folder, still=still)
         good = sum(r["diagnose"].startswith(("first", "refused")) for r in rows)
-        blind = sum(r["diagnose"] == "not told apart" for r in rows)
+        blind = sum(r["diagnose"] == "not distinguished" for r in rows)
         print(
             f"\nWrong conventions written into the files, {plan}: {good} of {len(rows)} named, "
-            f"{blind} said not to be told apart"
+            f"{blind} said not to be distinguishable"
         )
-        print(f"{'mistake':44s} {'diagnose':24s} {'exit':>4s}  {'calibrate':12s} {'exit':>4s}  cure printed")
+        print(f"{'mistake':44s} {'diagnose':24s} {'exit':>4s}  {'calibrate':12s} {'exit':>4s}  remedy printed")
         for r in rows:
             print(
                 f"{r['mistake']:44s} {r['diagnose']:24s} {r['exit']:4d}  {r['calibrate']:12s} "

@@ -1,7 +1,7 @@
 """A real robot with a camera in hand: do mounts found from different corners agree within their stated uncertainty?
 
 Data: shared/data/robot-camera-kuka (Ali et al., Sensors 19 (2019) 2837): 28 images of a board of 408 corners.  One
-corner over the 28 poses is this package's problem: the corner is the ball, standing in the base M; H is the flange.
+corner over the 28 poses is this package's problem: the corner is the ball, fixed in the base M; H is the flange.
 """
 
 from __future__ import annotations

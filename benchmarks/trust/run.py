@@ -174,10 +174,8 @@ def _length_errors(cal: object, scan: PoseSequence, x: np.ndarray, errors: np.nd
     return errors @ (along @ (B[1] - B[0]))
 
 
-def rivals() -> None:
-    print(
-        "\nResidual d_rms (px) that each mistake leaves, by plan (M 2.7, noise 0.0207 px)  [same: cannot be told apart]"
-    )
+def alternatives() -> None:
+    print("\nResidual d_rms (px) that each mistake leaves, by plan (M 2.7, noise 0.0207 px)  [same: indistinguishable]")
     plans = {
         "paper 189, ball 20 mm off": (pose_grid(3), BALL),
         "paper 189, ball 1 mm off": (pose_grid(3), NEAR),
@@ -238,7 +236,7 @@ def images_needed() -> None:
         "object's pose removed)"
     )
     target = scan_target(SCANNER, T_HT=nominal_mount())
-    print(f"{'plan':34s} {'images':>7s} {'px':>8s} {'rivals not told apart':s}")
+    print(f"{'plan':34s} {'images':>7s} {'px':>8s} {'alternatives not distinguished':s}")
     for n in (2, 3, 4, 5):
         grid = pose_grid(n)
         C = predicted_covariance(SCANNER, grid, T_HT=nominal_mount(), t=BALL)
@@ -266,12 +264,12 @@ def _change(a: Fit, b: Fit) -> float:
 
 
 def outliers(runs: int) -> None:
-    """Against the clean data, and against the fit that is told which centres are bad: the first cannot be better than
+    """Against the clean data, and against the fit that knows which centres are bad: the first cannot be better than
     what the lost centres would have said, the second is what the search adds."""
     print(f"\nOutliers in 8 % of the centres, {runs} runs; changes in standard uncertainties, largest coordinate")
     print(
         f"{'plan, size of the errors':44s} {'found':>12s} {'others':>7s} {'change from clean':>18s} "
-        f"{'the same, told':>15s} {'from told':>10s}  (each: median, largest)"
+        f"{'the same, given':>15s} {'from given':>10s}  (each: median, largest)"
     )
     free = free_parameters((SCANNER,))
     for name, poses, low, high in (
@@ -344,7 +342,7 @@ def speed(draws: int) -> None:
         "s for 100,000 on two free cores"
     )
     poses_, observed = pose_grid(3), observe(pose_grid(3))
-    for words, options in (("calibrate, alone", {"hypotheses": False}), ("calibrate with quick rivals", {})):
+    for words, options in (("calibrate, alone", {"hypotheses": False}), ("calibrate with quick alternatives", {})):
         times = []
         for _ in range(10):
             begin = time.process_time()
@@ -387,7 +385,7 @@ def main() -> None:
     part = 10 if options.small else 1
     convergence(10_000 // part)
     coverage(1000)
-    rivals()
+    alternatives()
     images_needed()
     outliers(1000 // part)
     with tempfile.TemporaryDirectory() as folder:

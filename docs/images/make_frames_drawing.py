@@ -20,7 +20,7 @@ FONT = 'font-family="Helvetica, Arial, DejaVu Sans, sans-serif"'
 SCALE = 56.0
 MIDDLE = np.array([405.0, 235.0])
 
-# Seen from +y, a little from the source's side and from above: the source stands left, the detector right.
+# Seen from +y, a little from the source's side and from above: the source is left, the detector right.
 AZIMUTH, ELEVATION = np.radians(64.0), np.radians(17.0)
 TOWARDS_EYE = np.array([np.cos(AZIMUTH) * np.cos(ELEVATION), np.sin(AZIMUTH) * np.cos(ELEVATION), np.sin(ELEVATION)])
 RIGHT = np.cross([0.0, 0.0, 1.0], TOWARDS_EYE) / np.cos(ELEVATION)

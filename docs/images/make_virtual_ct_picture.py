@@ -21,7 +21,7 @@ import matplotlib.pyplot as plt
 FOLDER = Path(__file__).parent
 SCENES = FOLDER.parents[1] / "examples/scenes"
 POSE = 92
-"""A pose amid the grid, turned by 5 degrees."""
+"""A pose in the middle of the grid, turned by 5 degrees."""
 
 
 def crossing(profile, level: float) -> float:
@@ -55,7 +55,7 @@ def figures(run, image) -> dict[str, str]:
     correlation = (flat[:, 1:] * flat[:, :-1])[pairs].mean() / empty.var()
     return {
         "grey value of the empty beam": f"{white:.0f}",
-        "grey value amid the ball": f"{black:.0f}",
+        "grey value in the middle of the ball": f"{black:.0f}",
         "contrast of the ball (1 - black / white)": f"{1 - black / white:.3f}",
         "noise of the empty beam, standard deviation": f"{empty.std():.0f}",
         "signal-to-noise ratio of the empty beam": f"{white / empty.std():.0f}",

@@ -233,7 +233,8 @@ def _host() -> str:
 
 
 def _start_of(process: int) -> str:
-    """When a process began, in the system's ticks: its number alone is given again.  "0" where nobody tells."""
+    """When a process began, in the system's ticks: its number alone is given again.  "0" where the system does not
+    say."""
     try:
         return (
             Path(f"/proc/{process}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()[19]

@@ -139,7 +139,7 @@ class EngineError(TomoposeError):
 
 
 class EngineMissingError(EngineError):
-    """An optional package is not installed; `install_line` cures it."""
+    """An optional package is not installed; `install_line` is the command that installs it."""
 
     def __init__(self, message: str, *, install_line: str = "") -> None:
         super().__init__(message)

@@ -90,7 +90,7 @@ class EditedWarning(UserWarning):
 
 
 def _digest(document: Mapping[str, Any]) -> str:
-    """SHA-256 over a JSON object's content, whatever its layout and order, but for the digest itself and the time at
+    """SHA-256 over a JSON object's content, whatever its layout and order, except for the digest itself and the time at
     which it was written: the same input gives the same digest."""
     content = {key: value for key, value in document.items() if key != DIGEST}
     if isinstance(content.get("provenance"), dict):

@@ -87,7 +87,7 @@ class Key:
 
     @classmethod
     def from_json(cls, block: object) -> Key | None:
-        """A kept key; None where the block is none, so that what lies beside it is not used."""
+        """A kept key; None where the block is not valid, so that what lies beside it is not used."""
         if not isinstance(block, Mapping) or not isinstance(block.get("parts"), Mapping):
             return None
         parts = {str(name): str(value) for name, value in block["parts"].items()}

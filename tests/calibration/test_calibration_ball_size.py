@@ -100,7 +100,8 @@ UNITS = [("centimetres (cm)", 10.0), ("inches (inch)", 25.4), ("metres (m)", 100
 
 @pytest.mark.parametrize(("words", "factor"), UNITS)
 def test_positions_in_another_unit_are_refused_by_name_on_every_route(words, factor):
-    """The table stands still, so that the centres fit as well; several balls, several runs and a moving scanner too."""
+    """The table does not move, so that the centres fit as well; several balls, several runs and a moving scanner
+    too."""
     message = re.escape(f"positions look like {words}")
     poses = paper_poses(2)
     shorter = replace(poses, T_MH=replace(poses.T_MH, t=poses.T_MH.t / factor))

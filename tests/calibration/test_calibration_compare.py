@@ -87,7 +87,7 @@ def entry(value, u):
 @pytest.mark.parametrize(("n", "bump"), [(6, 14.0), (20, 6.5)])
 @pytest.mark.parametrize("u", [1.0, 0.3])
 def test_a_single_bumped_run_is_flagged_among_few_and_many(n, bump, u):
-    """Runs scatter by 1, whether they state it (u 1) or not (u 0.3); one is off, wherever it stands."""
+    """Runs scatter by 1, whether they state it (u 1) or not (u 0.3); one is off, whatever its place."""
     for seed in range(20):
         rng = np.random.default_rng(seed)
         value = rng.normal(0, 1, n)

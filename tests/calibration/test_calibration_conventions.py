@@ -1,4 +1,4 @@
-"""A wrong convention written into the files is named by the command line, with the line that would cure it."""
+"""A wrong convention written into the files is named by the command line, with the line that would fix it."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_half_a_pixel_is_named_and_refused_where_the_scanner_is_exact(study, tmp
     assert calibrated["verdict"] in ("rejected", "doubtful")
 
 
-def test_what_cannot_be_told_is_said(study, tmp_path):
+def test_what_cannot_be_distinguished_is_said(study, tmp_path):
     code, said, code_c, _ = ran(study, tmp_path, "order ZYX", still=True)
     assert code == code_c == 0
     assert next(h["outcome"] for h in said["hypotheses"] if h["name"] == "order ZYX") == "same"

@@ -1,4 +1,4 @@
-"""Every rival is found when it is the truth, and the poses' blindness is stated."""
+"""Every alternative is found when it is the truth, and the poses' blindness is stated."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def written_as(R, t, alpha=MIXED.alpha, **columns):
 
 
 def mistakes():
-    """name of the rival that is true -> (poses as declared, centres as declared)."""
+    """name of the alternative that is true -> (poses as declared, centres as declared)."""
     T, exact = MIXED.T_MH, observe(MIXED).x_D
     n_u, n_v = SCANNER.n_u - 1, SCANNER.n_v - 1
     Rt = np.swapaxes(T.R, 1, 2)
@@ -71,7 +71,7 @@ CASES = mistakes()
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_true_rival_comes_first(name):
+def test_the_true_alternative_comes_first(name):
     poses, x = CASES[name]
     found = diagnose(SCANNER, poses, BallObservations.from_sigma(x, 0.0146, pose_id=poses.pose_id))
     best = found.hypotheses[0]
@@ -83,7 +83,7 @@ def test_the_true_rival_comes_first(name):
     assert all(h.remedy for h in found.better)
 
 
-def test_quick_rivals_reject_a_calibration():
+def test_quick_alternatives_reject_a_calibration():
     poses, x = CASES["sign of UVW"]
     cal = calibrate(SCANNER, poses, BallObservations.from_sigma(x, 0.0146, pose_id=poses.pose_id))
     assert cal.verdict == "rejected"
@@ -92,7 +92,7 @@ def test_quick_rivals_reject_a_calibration():
     assert cal.hypotheses[0].remedy
 
 
-def test_mixed_poses_tell_all_but_the_true_symmetries():
+def test_mixed_poses_distinguish_all_but_the_true_symmetries():
     found = diagnose(SCANNER, MIXED, observe(MIXED))
     assert found.hypotheses[0].outcome == "declared"
     assert {h.name for h in found.same} == {"table zero", "image turned by 180 degrees and table sign"}
@@ -101,7 +101,7 @@ def test_mixed_poses_tell_all_but_the_true_symmetries():
 
 
 def test_the_papers_plan_is_blind_to_what_it_is_blind_to():
-    """Order and half a pixel leave the noise floor: the headline of what such a plan cannot tell."""
+    """Order and half a pixel leave the noise floor: the headline of what such a plan cannot determine."""
     poses = paper_poses()
     found = diagnose(SCANNER, poses, observe(poses))
     same = {h.name for h in found.same}
@@ -120,7 +120,7 @@ def test_a_ball_on_the_pivot_hides_signs():
     assert 0.02 < wrong.d_rms < 0.2
 
 
-def test_set_and_encoder_poses_are_rivals():
+def test_set_and_encoder_poses_are_alternatives():
     rng = np.random.default_rng(2)
     off = replace(MIXED.T_MH, t=MIXED.T_MH.t + rng.normal(0, 0.02, (len(MIXED), 3)))
     declared = replace(MIXED, T_MH=off, T_MH_set=MIXED.T_MH)
@@ -129,7 +129,7 @@ def test_set_and_encoder_poses_are_rivals():
     assert calibrate(SCANNER, declared, observe(MIXED)).verdict == "rejected"
 
 
-def test_rivals_change_nothing_and_have_different_names():
+def test_alternatives_change_nothing_and_have_different_names():
     problem = pair(SCANNER, MIXED, observe(MIXED))
     before = [a.copy() for a in (problem.R_MH, problem.t_MH, problem.x_D, problem.alpha)]
     for alternative in ALTERNATIVES:

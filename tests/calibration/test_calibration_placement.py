@@ -1,4 +1,4 @@
-"""A ball off the panel or at the focal spot is named; directions of many balls are told by their groups."""
+"""A ball off the panel or at the focal spot is named; directions of many balls are named by their groups."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ def test_poses_that_only_turn_about_one_point_hold_no_length(scanner, T_HT, rng,
         calibrate(scanner, poses, observed)
 
 
-def test_freeing_what_the_poses_cannot_tell_is_refused(scanner, T_HT):
+def test_freeing_what_the_poses_cannot_determine_is_refused(scanner, T_HT):
     poses = grid_poses()
     observed = observe(scanner, poses, T_HT, np.ones(3))
     for name in ("d_SR", "eta", "translation_scale"):

@@ -56,7 +56,7 @@ def test_eight_per_cent_of_outliers_are_found_and_change_nothing(plan, seed):
 
 @pytest.mark.parametrize(("plan", "low", "high"), [("paper", 0.0, 30.0), ("mixed", 0.0, 30.0), ("mixed", 0.05, 0.5)])
 def test_outliers_leave_the_fit_of_the_good_centres(plan, low, high):
-    """Against the fit that is told which centres are bad.  Errors of a few sigma come and go at the border: a row that
+    """Against the fit that knows which centres are bad.  Errors of a few sigma come and go at the border: a row that
     does must not end the search."""
     poses = PLANS[plan]
     n, free = len(poses), free_parameters((SCANNER,))
@@ -218,7 +218,7 @@ def test_two_magnifications_are_solved_together():
 # -- pose noise -------------------------------------------------------------------------------------------------------
 
 
-def test_pose_noise_is_told_from_detection_noise():
+def test_pose_noise_is_distinguished_from_detection_noise():
     poses = mixed_poses(n=150)
     rng = np.random.default_rng(7)
     scattered = replace(

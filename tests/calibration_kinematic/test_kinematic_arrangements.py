@@ -93,7 +93,7 @@ def test_held_out_poses_as_if_refitted() -> None:
 
 
 def test_exact_data_give_the_exact_trajectory() -> None:
-    """Without noise the errors that matter are found although 42 numbers cannot be told apart."""
+    """Without noise the errors that matter are found although 42 numbers cannot be distinguished."""
     e = hexapod_experiment(HEXAPOD, "mixed", 5, disturbance=Disturbance(scatter=Repeatability(t_mm=0.0, w_rad=0.0)))
     rng = np.random.default_rng(np.random.SeedSequence([9, 9]))
     machine = replace(HEXAPOD, scale_sigma=0.0, geometry_sigma=0.0, repeatability=Repeatability(t_mm=0.0, w_rad=0.0))
@@ -125,7 +125,7 @@ def test_exact_data_give_the_exact_trajectory() -> None:
 # -- unknown kinematics -----------------------------------------------------------------------------------------------
 
 
-def test_one_ball_cannot_tell_turns_without_kinematics() -> None:
+def test_one_ball_cannot_determine_rotations_without_kinematics() -> None:
     e = hexapod_experiment(HEXAPOD, "mixed", 0)
     rigid = calibrate(e.scanner, e.poses, e.observations, model="rigid", hypotheses=False)
     cal = calibrate_kinematic(e.scanner, e.poses, e.observations, rigid=rigid, model="slack")
@@ -182,7 +182,7 @@ def test_quiet_runs_raise_no_alarm() -> None:
         assert all(e.p > SIGNIFICANT for e in movements_of(linear_fit(estimate), estimate.state.T_HT.R))
 
 
-def test_slipped_ball_is_told() -> None:
+def test_slipped_ball_is_named() -> None:
     e = hexapod_experiment(HEXAPOD, "mixed", 0, size=0.0)
     T_HT = RigidTransform.from_angles([0.0, 0.0, np.pi], [1.0, 2.0, 1.0], source=Frame.H, target=Frame.T)
     t = np.tile([12.0, -14.0, 10.0], (189, 1))
@@ -204,7 +204,7 @@ def test_slipped_ball_is_told() -> None:
 
 
 def carm(rng: np.random.Generator, *, n: int = 150) -> tuple[Scanner, PoseSequence, RigidTransform, np.ndarray]:
-    """A hexapod carries source and detector about a standing ball; non-square pixels, off-centre piercing point."""
+    """A hexapod carries source and detector about a fixed ball; non-square pixels, off-centre piercing point."""
     scanner = Scanner(d_SD=1200.0, d_SR=310.0, p_u=0.2, p_v=0.25, u_0=733.4, v_0=512.7, n_u=1501, n_v=1203).exact()
     poses = PoseSequence.from_table(rng.uniform(-12, 12, (n, 3)), rng.uniform(-6, 6, (n, 3)))
     T_MT = RigidTransform.from_angles([0.02, -0.01, 0.03], [3.0, 1.0, -2.0], source=Frame.H, target=Frame.T)
@@ -270,7 +270,7 @@ def test_one_more_number_a_view(rng: np.random.Generator) -> None:
     assert np.std((found - d_SD)[known]) < 0.3
 
 
-def test_no_table_under_a_standing_object(rng: np.random.Generator) -> None:
+def test_no_table_under_a_fixed_object(rng: np.random.Generator) -> None:
     scanner, poses, _, _ = carm(rng)
     observations = BallObservations.from_sigma(np.zeros((len(poses), 2)), SIGMA, pose_id=poses.pose_id)
     with pytest.raises(InputError, match="no rotary table"):
@@ -354,7 +354,7 @@ def test_ball_object_calibrates_itself(scanner: Scanner, rng: np.random.Generato
     assert len(poses) == 40
 
 
-def test_balls_that_cannot_tell_are_refused(scanner: Scanner) -> None:
+def test_balls_without_information_are_refused(scanner: Scanner) -> None:
     with pytest.raises(InputError, match="at least 4"):
         pose_from_balls(scanner, np.zeros((3, 2)), BALLS[:3])
     with pytest.raises(InputError, match="must pair"):

@@ -114,7 +114,7 @@ def test_backlash_and_drift_do_not_ruin_it(kind: str, worn: dict[str, float]) ->
     assert 0.9 < error.inside < 0.995
     lag = cal.errors.lag
     assert lag.names == tuple(name for name in cal.tangent if name.startswith("lag_"))
-    assert not any("lag_" in name for name in cal.errors.names), "wear is told apart from the geometry"
+    assert not any("lag_" in name for name in cal.errors.names), "wear is distinguished from the geometry"
     assert max(cal.errors.scatter.t) > 0.0006, "what the run drifted may come again"
     assert any("drifted" in reason for reason in cal.reasons)
 
@@ -129,7 +129,7 @@ def test_leg_backlash_follows_the_scan() -> None:
     )
     back = corrected_poses(cal.errors, commands_for(cal.errors, e.scan))
     off = np.abs(back.T_MH.t - e.scan.T_MH.t).max(axis=1)
-    assert np.mean(off > 1e-3) < 0.02, "but for poses at which a leg turns round in one table and not in the other"
+    assert np.mean(off > 1e-3) < 0.02, "except for poses at which a leg turns round in one table and not in the other"
     assert off.max() < 0.006
 
 
@@ -139,7 +139,8 @@ def test_robot_on_the_table() -> None:
 
 
 def test_scale_of_a_robot_alone_is_as_good_as_its_links() -> None:
-    """With one ball and the table still, what is left is the scale of the object, whatever the poses; it is told."""
+    """With one ball and the table still, what is left is the scale of the object, whatever the poses; a message says
+    so."""
     e = robot_experiment(ROBOT, 1)
     cal = found(e)
     error, before = scan_error(cal, e), scan_error(rigid_of(e), e).shared

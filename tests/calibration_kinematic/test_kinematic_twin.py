@@ -1,4 +1,4 @@
-"""Twin robots: source and detector each on a robot of its own about a standing ball."""
+"""Twin robots: source and detector each on a robot of its own about a fixed ball."""
 
 from __future__ import annotations
 
@@ -112,12 +112,12 @@ def test_perfect_twins_stay_trusted() -> None:
     assert twin_scan_error(cal, e)[0] < 0.03
 
 
-def test_what_views_cannot_tell_of_the_panel_is_refused(twins: TwinExperiment) -> None:
-    """A pitch is found where the views tell it; a prior makes it serve where they do not."""
+def test_what_views_cannot_determine_of_the_panel_is_refused(twins: TwinExperiment) -> None:
+    """A pitch is found where the views determine it; a prior makes it usable where they do not."""
     e = twins
     rough = BallObservations.from_sigma(e.observations.x_D[:20], 5.0, pose_id=e.observations.pose_id[:20])
     few = replace(e, observations=rough)
-    with pytest.raises(NotObservableError, match="these poses tell p_u only to") as error:
+    with pytest.raises(NotObservableError, match="these poses determine p_u only to") as error:
         calibrated(few, "rigid", free=("p_u",))
     assert error.value.direction == "p_u"
     held = calibrated(replace(few, scanner=replace(e.scanner, sigma={"p_u": 1e-4, "d_SD": 0.5})), "rigid")

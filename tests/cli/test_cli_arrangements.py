@@ -1,4 +1,4 @@
-"""Source and detector that move about a standing object, through the front door: one manipulator, and twin robots."""
+"""Source and detector that move about a fixed object, through the front door: one manipulator, and twin robots."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def matrices(folder, cal, *more):
 
 @pytest.fixture
 def gantry(tmp_path, scanner, rng):
-    """A hexapod with joints 0.1 mm off carries the scanner: two standing balls, 150 poses; a tilting scan."""
+    """A hexapod with joints 0.1 mm off carries the scanner: two fixed balls, 150 poses; a tilting scan."""
     machine = replace(typical_hexapod(), scale_sigma=0.0, geometry_sigma=0.0)
     p = rng.standard_normal(len(machine.names)) * machine.sigma
     mount = tp.RigidTransform.from_angles([0.02, -0.01, 0.03], [3.0, 1.0, -2.0], source=tp.Frame.H, target=tp.Frame.T)
@@ -139,7 +139,7 @@ def test_commands_move_the_scanner_where_it_was_wanted(gantry):
 
 
 def test_a_moving_scanner_of_unknown_kinematics(gantry, capsys):
-    """A map of pose errors serves the inverse chain too, and says what the balls cannot tell."""
+    """A map of pose errors serves the inverse chain too, and says what the balls cannot determine."""
     folder, truth = gantry[0], gantry[4]
     moving = ("--arrangement", "moving-scanner")
     assert calibrate(folder, "rigid", *moving, "--model", "rigid") == 3
@@ -151,7 +151,7 @@ def test_a_moving_scanner_of_unknown_kinematics(gantry, capsys):
         error[name] = rms_px(without_object_pose(found.P, truth, CORNERS))
     assert error["slack"] < error["rigid"]
     assert calibrate(folder, "x", *moving, "--model", "slack", "--d-sd-sigma-mm", "0.2") == 1
-    assert "cannot be told from poses that scatter" in capsys.readouterr().err
+    assert "cannot be distinguished from poses that scatter" in capsys.readouterr().err
 
 
 def test_a_scanner_that_moves_is_named(gantry):

@@ -111,7 +111,7 @@ def test_doctor_lists_engines_and_install_lines(capsys):
     assert shown["extras"]["recon"]["install"].startswith("pip install")
 
 
-def test_a_rival_that_fits_better_is_exit_code_3(files, capsys):
+def test_an_alternative_that_fits_better_is_exit_code_3(files, capsys):
     """Rows exchanged among poses: the files are well formed, but the reading of them is wrong."""
     wrong = files.folder / "signs.csv"
     angles = np.degrees(files.poses.T_MH.angles) * [-1, -1, -1]

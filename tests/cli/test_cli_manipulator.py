@@ -95,7 +95,7 @@ def test_scale_bars_are_written_one_way(erring, capsys):
     assert "--distance" in capsys.readouterr().err
 
 
-def test_matrices_tell_the_shared_part_from_the_scatter(erring, capsys):
+def test_matrices_separate_the_shared_part_from_the_scatter(erring, capsys):
     folder = erring[0]
     assert calibrate(folder, "--manipulator", folder / "hexapod.json", "--out", folder / "cal") == 0
     words = ["matrices", "--calibration", folder / "cal" / "calibration.json", "--poses", folder / "scan.csv"]
@@ -113,7 +113,7 @@ def test_matrices_tell_the_shared_part_from_the_scatter(erring, capsys):
     assert run([*map(str, [*words, "--quiet", "--home", "nowhere", "--out", folder / "x.npz"])]) == 1
 
 
-def test_a_robot_alone_is_told_that_its_links_hold_the_scale(tmp_path, monkeypatch, capsys):
+def test_the_plan_of_a_robot_alone_says_that_its_links_hold_the_scale(tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "benchmarks" / "manipulator"))
     from manipulator_cases import robot_experiment
 

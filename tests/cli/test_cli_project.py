@@ -1,4 +1,4 @@
-"""A project file says once what every verb is told; two commands lead from people's files to a report."""
+"""A project file states once what every verb needs; two commands lead from people's files to a report."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def test_import_poses_and_import_scanner_write_where_the_project_says(tmp_path, 
     assert tp.read_scanner(tmp_path / "geo" / "scanner.json").d_SD == 1173.53
 
 
-def test_a_geometry_file_of_another_kind_is_answered_with_the_way_on(shared_data, tmp_path, capsys):
+def test_a_geometry_file_of_another_kind_is_answered_with_how_to_proceed(shared_data, tmp_path, capsys):
     file = shared_data / "cases" / "vendor-geometry" / "part.xtekct"
     assert run(["import-geometry", str(file), "--out", str(tmp_path / "m.npz")]) == 1
     assert "its scanner: tomopose import-scanner part.xtekct --out scanner.json" in capsys.readouterr().err

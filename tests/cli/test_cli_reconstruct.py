@@ -94,7 +94,7 @@ def test_wrong_number_of_images_is_named(scan, capsys):
 
 
 @pytest.mark.parametrize("size", ["0", "10,10", "ten"])
-def test_sizes_that_are_none(scan, size, capsys):
+def test_sizes_that_are_not_sizes_are_refused(scan, size, capsys):
     assert run(words(scan, "--size", size)) == 2
     assert "--size" in capsys.readouterr().err
 

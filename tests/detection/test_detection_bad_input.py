@@ -265,7 +265,7 @@ def test_diameter_that_no_image_of_a_run_shows(scene: Scene, clean: Array) -> No
 
 
 def test_ball_that_slips_is_measured_where_it_is(scene: Scene) -> None:
-    """A slip is no fault of an image: each is right for itself, and the step stands in the run for calibration."""
+    """A slip is no fault of an image: each is right for itself, and the step is in the run for calibration."""
     moved = scene_of(radius_px=40.0, u=152.8, v=160.6, n=N)
     images = [counts(frame(s), seed=k) for k, s in enumerate((scene, scene, moved, moved))]
     observations = detect(images, scene.scanner, ball_diameter=2 * scene.radius)

@@ -209,7 +209,7 @@ def test_a_shape_of_another_size_is_not_the_ball(run: tuple[Scanner, list[np.nda
     assert "the ball in the other images" in (seen.status or ())[6]
 
 
-def test_an_interrupted_run_goes_on_from_its_journal(
+def test_an_interrupted_run_continues_from_its_journal(
     run: tuple[Scanner, list[np.ndarray], np.ndarray], tmp_path: Path
 ) -> None:
     scanner, images, _ = run

@@ -66,7 +66,7 @@ def test_what_chance_may_do_does_not_count() -> None:
 
 
 def shares(*, offset: float = 0.0, scale: float = 1.0, noise: float = 1.0) -> Array:
-    """What 12 sectors of 22 x 9 px keep of their weight: white residuals, but for an offset in the fifth."""
+    """What 12 sectors of 22 x 9 px keep of their weight: white residuals, except for an offset in the fifth."""
     s, along = np.meshgrid(np.arange(0.5, 22.0), np.arange(12 * 9.0), indexing="ij")
     left = (along // 9).astype(np.int64).ravel()
     residual = scale * np.random.default_rng(4).normal(size=left.size) + offset * (left == 5)

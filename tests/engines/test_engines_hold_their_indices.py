@@ -41,7 +41,7 @@ def scenes(draw):
     aside = np.array([draw(near), draw(near)]) * draw(st.sampled_from([0.0, 0.6, 2.5])) * [n_u * p_u, n_v * p_v]
     n = draw(st.integers(1, 4))
     arc = draw(st.sampled_from([0.3, math.pi, 2 * math.pi]))
-    # 1e-15: a column seen edge-on but for rounding, whose inequalities divide by almost nothing
+    # 1e-15: a column seen edge-on except for rounding, whose inequalities divide by almost nothing
     tilt, first = draw(st.sampled_from([0.0, 1e-15, 1e-11, 0.14, 1.5])), draw(st.sampled_from([0.0, 0.4, math.pi / 2]))
     source, middle, U, V = [], [], [], []
     for k in range(n):

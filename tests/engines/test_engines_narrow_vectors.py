@@ -1,4 +1,4 @@
-"""Processors without AVX-512 take vectors of 8 lanes; here they are told so."""
+"""Processors without AVX-512 take vectors of 8 lanes; here they are made to report so."""
 
 from __future__ import annotations
 

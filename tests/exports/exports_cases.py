@@ -1,4 +1,4 @@
-"""Geometries for the tests of exports: panels that stand anywhere, built here without the library's mathematics."""
+"""Geometries for the tests of exports: panels anywhere, built here without the library's mathematics."""
 
 from __future__ import annotations
 

@@ -352,7 +352,7 @@ def damage_bytes(whole, rng):
 
 @pytest.mark.parametrize("file", [*MAIN_FILE.values(), "cera_projtable.txt", "rtk.json", "thd/view_2.json"])
 def test_damage_is_an_error_of_the_tree_or_a_whole_geometry(file, bare, matrices):
-    """Whatever stands in a file: never another exception, never a number that is not finite, never fewer views."""
+    """Whatever is in a file: never another exception, never a number that is not finite, never fewer views."""
     rng = np.random.default_rng(len(file))
     file = "thd/view_0.json" if file == "thd" else file
     path, whole = bare / file, (bare / file).read_bytes()

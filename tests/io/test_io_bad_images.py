@@ -221,7 +221,7 @@ def test_raw_needs_a_layout_with_endianness_that_fits(tmp_path):
         open_images(tmp_path, raw_layout=RawLayout(shape=SHAPE, dtype="<u2"))
 
 
-def test_hdf5_and_dicom_that_are_none_are_named(tmp_path):
+def test_files_that_are_not_hdf5_or_dicom_are_named(tmp_path):
     (tmp_path / "a.h5").write_text("no HDF5")
     with pytest.raises(FileError, match=r"a.h5 is no readable HDF5 file"):
         open_images(tmp_path / "a.h5")

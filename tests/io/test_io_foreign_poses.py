@@ -112,7 +112,7 @@ def test_poses_of_two_tools_are_refused(write):
         ("a.jbi", "/JOB\n//NAME A\n//POS\n///PULSE\nC00000=1,2,3,4,5,6\n//INST\n", "encoder pulses"),
     ],
 )  # fmt: skip
-def test_poses_that_a_file_does_not_state_are_refused_with_the_way_on(name, text, reason, write):
+def test_poses_that_a_file_does_not_state_are_refused_with_how_to_proceed(name, text, reason, write):
     with pytest.raises(InputError, match=reason):
         tp.read_pose_log(write(name, text))
 
@@ -391,7 +391,7 @@ def test_a_terminal_log_joins_images_by_the_time_of_its_replies(shared_data, wri
         ("a.txt", "", "the file is empty"),
     ],
 )
-def test_a_file_of_another_kind_is_answered_with_the_way_on(name, content, says, tmp_path):
+def test_a_file_of_another_kind_is_answered_with_how_to_proceed(name, content, says, tmp_path):
     (tmp_path / name).write_bytes(content.encode("latin-1"))
     with pytest.raises(FileError, match=says):
         tp.read_pose_log(tmp_path / name)

@@ -1,4 +1,4 @@
-"""Scanner files as makers write them: values, what is not stated, which reading was taken, and the way on."""
+"""Scanner files as makers write them: values, what is not stated, which reading was taken, and how to proceed."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ Rotation Step (deg)=0.600
 """
 
 
-def test_the_image_pixel_tells_whether_a_skyscan_camera_pixel_is_the_binned_one(write):
+def test_the_image_pixel_shows_whether_a_skyscan_camera_pixel_is_the_binned_one(write):
     plain = tp.read_scanner_draft(write("a.log", SKYSCAN.format(image=40.0, binning="1x1")))
     assert plain.values["p_u_mm"] == pytest.approx(0.0748)
     assert plain.notes == ()
@@ -300,6 +300,6 @@ def test_a_zeiss_container_without_its_reader_says_what_to_install(tmp_path, mon
         ("notes.txt", "measured on Tuesday\n", "write what you know as lines"),
     ],
 )
-def test_files_of_other_kinds_are_answered_with_the_way_on(name, content, says, write):
+def test_files_of_other_kinds_are_answered_with_how_to_proceed(name, content, says, write):
     with pytest.raises(FileError, match=says):
         tp.read_scanner_draft(write(name, content))

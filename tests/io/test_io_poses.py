@@ -158,7 +158,7 @@ def test_the_pivot_is_read_with_commas_or_blanks(table):
         assert read_poses(table(f"# pivot_mm: {text}\n" + GOOD)).pivot.tolist() == [1, 2.5, -3]
 
 
-def test_joints_need_forward_kinematics_if_they_stand_alone(table):
+def test_joints_need_forward_kinematics_if_they_are_alone(table):
     path = table("pose_id,q1_deg,q2_mm\n0,90,1\n1,45,2\n")
     with pytest.raises(InputError, match=r"forward kinematics \(forward=\)"):
         read_poses(path)
@@ -242,9 +242,9 @@ def test_a_pivot_that_changes_within_the_table_is_refused(table):
         ("1e999", "too large"),
         ("abc", "'abc' is no finite number"),
         ("1_000", "'1_000' is no finite number"),
-        ("9999", "9999 stands for a missing value"),
-        ("-9999.9", "-9999.9 stands for a missing value"),
-        ("99999.000", "stands for a missing value"),
+        ("9999", "9999 denotes a missing value"),
+        ("-9999.9", "-9999.9 denotes a missing value"),
+        ("99999.000", "denotes a missing value"),
     ],
 )
 def test_a_cell_that_is_no_number_is_named_by_row_and_column(table, cell, message):
@@ -263,13 +263,13 @@ def test_mixed_decimal_marks_are_refused(table):
 
 
 def test_duplicate_ids_are_refused(table):
-    with pytest.raises(InputError, match="pose_id '0' stands in rows 1 and 2"):
+    with pytest.raises(InputError, match="pose_id '0' appears in rows 1 and 2"):
         read_poses(table(GOOD.replace("\n1,", "\n0,")))
 
 
 def test_duplicate_images_are_refused_unless_the_ball_differs(table):
     rows = f"{HEAD},image\n0,-10,0,10,0,5,0,a.tif\n1,10,1,-10,0,-5,1,a.tif\n"
-    with pytest.raises(InputError, match=r"image 'a.tif' stands in rows 1 and 2"):
+    with pytest.raises(InputError, match=r"image 'a.tif' appears in rows 1 and 2"):
         read_poses(table(rows))
     two = f"{HEAD},image,ball_id\n0,-10,0,10,0,5,0,a.tif,0\n1,10,1,-10,0,-5,1,a.tif,1\n"
     assert read_poses(table(two)).image == ("a.tif", "a.tif")

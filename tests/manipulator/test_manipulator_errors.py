@@ -115,7 +115,7 @@ def test_commands_reach_the_wanted_poses(which: str, rng: np.random.Generator) -
     reached = corrected_poses(errors, command)
     assert rotation_angle_between(reached.T_MH.R, wanted.T_MH.R).max() < 1e-9
     assert np.abs(reached.T_MH.t - wanted.T_MH.t).max() < 1e-6
-    assert np.abs(command.T_MH.t - wanted.T_MH.t).max() > 1e-3, "without the correction it stood elsewhere"
+    assert np.abs(command.T_MH.t - wanted.T_MH.t).max() > 1e-3, "without the correction it was elsewhere"
     assert (command.q is None) == (wanted.q is None)
 
 
@@ -225,7 +225,7 @@ def test_leg_backlash_moves_legs(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(np.abs(change), 0.005, atol=1e-6)
 
 
-def test_encoders_stand_beside_set_poses(rng: np.random.Generator) -> None:
+def test_encoders_are_kept_beside_set_poses(rng: np.random.Generator) -> None:
     poses = hexapod_poses(rng, 200)
     log = encoder_readout(poses, settling=Repeatability(t_mm=0.002, w_rad=2e-5), rng=rng)
     assert log.T_MH_set is not None

@@ -43,7 +43,7 @@ def test_forward_undoes_inverse(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(t, poses.T_MH.t, atol=NM)
 
 
-def test_without_errors_the_plate_stands_where_it_was_sent(rng: np.random.Generator) -> None:
+def test_without_errors_the_plate_is_where_it_was_commanded(rng: np.random.Generator) -> None:
     machine, poses = everything(), some_poses(rng)
     real = machine.real_poses(poses, np.zeros(len(machine.names)))
     assert rotation_angle_between(real.R, poses.T_MH.R).max() < NRAD
@@ -84,7 +84,7 @@ def test_jacobian_is_exact(rng: np.random.Generator) -> None:
         np.testing.assert_allclose(real.J[:, 3:, i] * sigma, t * sigma, atol=1e-6, err_msg=machine.names[i])
 
 
-def test_turned_axes_turn_elsewhere_but_shift_as_told() -> None:
+def test_turned_axes_turn_elsewhere_but_shift_as_commanded() -> None:
     """Turning axes rotated by 2.6 mrad about z against the shifting axes, field observation on a real hexapod."""
     machine = Hexapod(
         base_joints=typical_hexapod().base_joints,

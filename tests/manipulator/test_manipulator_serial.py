@@ -34,7 +34,7 @@ def test_sliding_joint_slides_along_z() -> None:
 
 
 def test_modified_form_holds_the_same_arm(rng: np.random.Generator) -> None:
-    """a and alpha move to the joint behind them: Rot_x(alpha_k) Trans_x(a_k) then stand before joint k + 1."""
+    """a and alpha move to the joint behind them: Rot_x(alpha_k) Trans_x(a_k) then come before joint k + 1."""
     robot = typical_robot()
     a, alpha = [0.0] + [j.a for j in robot.joints], [0.0] + [j.alpha for j in robot.joints]
     modified = SerialRobot(

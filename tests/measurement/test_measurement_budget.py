@@ -50,7 +50,7 @@ def test_the_calibration_adds_in_squares():
     assert found.dof == pytest.approx(40 * (0.0025 / 0.002) ** 4)
 
 
-def test_a_simulation_stands_for_fit_and_calibration_and_corrects_the_value():
+def test_a_simulation_covers_fit_and_calibration_and_corrects_the_value():
     found = budget(
         result(), calibration=0.0015, simulated=drawn(0.004, 0.001, u_fit=0.002, dof_fit=800.0, with_calibration=True)
     )

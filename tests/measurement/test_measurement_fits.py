@@ -121,7 +121,7 @@ def test_common_errors_of_neighbours_widen_the_uncertainty_by_what_they_cost(len
 
 
 @pytest.mark.parametrize("correlated", [True, False])
-def test_points_weigh_by_the_areas_they_stand_for(correlated):
+def test_points_weigh_by_the_areas_they_represent(correlated):
     """Half of the points crowd together.  The stated uncertainty is that of the mean weighed by areas, w' C w; where
     neighbours share errors it is quieter than the mean of all points."""
     rng = np.random.default_rng(9)
@@ -236,7 +236,7 @@ class TestMeasurands:
 
         return f if f.direction @ normals[0] > 0 else _turned(f)
 
-    def test_steps_and_thicknesses_are_told_apart(self):
+    def test_steps_and_thicknesses_are_distinguished(self):
         assert m.distance(self.plane(0, 1), self.plane(3, 1)).direction == "unidirectional"
         assert m.distance(self.plane(0, -1), self.plane(3, 1)).direction == "bidirectional"
 

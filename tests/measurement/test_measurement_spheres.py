@@ -1,4 +1,4 @@
-"""A standard of 27 balls on shafts: found, told apart, measured."""
+"""A standard of 27 balls on shafts: found, distinguished, measured."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def layout(rng):
 
 @pytest.fixture(scope="module")
 def standard():
-    """The volume and the calibrated centres; every ball stands on a shaft of a third of its diameter."""
+    """The volume and the calibrated centres; every ball is on a shaft of a third of its diameter."""
     rng = np.random.default_rng(3)
     calibrated = layout(rng)
     centres = calibrated @ R.T + T

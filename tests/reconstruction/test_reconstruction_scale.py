@@ -97,7 +97,7 @@ class Dying:
 
 @pytest.mark.parametrize("where", ["memory", "disk"])
 @pytest.mark.parametrize("after", [BEFORE + 20, BEFORE + 60, BEFORE + 85])  # in the FDK start, in both sweeps of SART
-def test_a_killed_run_goes_on_to_the_same_numbers(where, after, tmp_path):
+def test_a_killed_run_continues_to_the_same_numbers(where, after, tmp_path):
     execution = Execution(checkpoint=tmp_path / "state", checkpoint_seconds=0.0)
     if where == "disk":
         execution = replace(execution, slabs=2, scratch=tmp_path / "slabs")

@@ -24,7 +24,7 @@ def load(name: str) -> ModuleType:
     return module
 
 
-def test_a_second_table_angle_tells_what_the_residual_cannot(capsys):
+def test_a_second_table_angle_shows_what_the_residual_cannot(capsys):
     still, turned = load("what_poses_can_tell").main().values()
     assert still.d_rms == pytest.approx(turned.d_rms, rel=0.15)  # the fit looks as good
     for name, gain in (("d_SR", 20.0), ("u_0", 20.0), ("t_HT_x", 20.0)):

@@ -1,4 +1,4 @@
-"""docs/paper-in-code.md: each equation, table and figure stands there once, and what it names exists."""
+"""docs/paper-in-code.md: each equation, table and figure appears there once, and what it names exists."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def resolve(name: str) -> object:
     raise ModuleNotFoundError(name)
 
 
-def test_each_item_of_the_paper_stands_there_exactly_once():
+def test_each_item_of_the_paper_appears_there_exactly_once():
     assert [paper for paper, _ in rows()] == list(EXPECTED)
 
 

@@ -113,7 +113,8 @@ def test_the_other_reports_are_drawn(chromium, sample, scan, tmp_path):
 
 
 def test_a_page_that_tries_to_load_is_noticed_and_stopped(chromium, sample, tmp_path):
-    """The checks above can fail: a smuggled address is refused by the page's policy, and seen where there is none."""
+    """The checks above can fail: a smuggled address is refused by the page's policy, and seen where there is no
+    policy."""
     _, observations, _ = sample()
     html = observations_report(observations).replace("</main>", '<img src="http://192.0.2.1/x.png"></main>')
     for name, page in (("guarded", html), ("open", re.sub(r"<meta http-equiv=.*?>", "", html))):

@@ -144,7 +144,7 @@ def test_parameters_without_uncertainty_are_not_determinable(sample):
     assert not re.search(r"\b(nan|inf)\b", shown, re.I)
 
 
-def test_images_without_a_ball_stand_beside_the_outliers(sample):
+def test_images_without_a_ball_are_beside_the_outliers(sample):
     calibration, observations, poses = sample()
     seen = dataclasses.replace(calibration, not_seen={"p999": "no ball found"})
     html = calibration_report(seen, observations=observations, poses=poses)

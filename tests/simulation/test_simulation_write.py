@@ -1,4 +1,4 @@
-"""`tomopose simulate` to files: TIFF and HDF5 hold the same, resume goes on, and no executor changes a byte."""
+"""`tomopose simulate` to files: TIFF and HDF5 hold the same, resume continues, and no executor changes a byte."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_a_changed_scene_starts_anew_and_equals_a_fresh_run(run, tmp_path, form)
         assert digests(folder) == digests(tmp_path / f"fresh-{number}")
 
 
-def test_an_interrupted_stack_of_another_scene_is_not_gone_on_with(run, tmp_path):
+def test_an_interrupted_stack_of_another_scene_is_not_continued(run, tmp_path):
     class StopError(Exception):
         pass
 

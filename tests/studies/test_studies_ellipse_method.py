@@ -1,4 +1,4 @@
-"""The stand-in for the paper's detector: exact where it can be, as coarse as whole pixels where it must be."""
+"""The substitute for the paper's detector: exact where it can be, as coarse as whole pixels where it must be."""
 
 from __future__ import annotations
 

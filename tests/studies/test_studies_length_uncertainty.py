@@ -194,7 +194,7 @@ def test_virtual_scans_draw_the_errors_of_a_manipulator(run, kinematic):
     assert 0 < found["SD"].u < 0.05 * VOXEL
 
 
-def test_a_scene_whose_manipulator_errs_is_believed_to_stand_where_the_calibration_puts_it(run, kinematic):
+def test_a_scene_whose_manipulator_errs_is_taken_to_be_where_the_calibration_puts_it(run, kinematic):
     """Identified errors are undone; without them the balls come out smeared and elsewhere."""
     machine = PoseMap(order=1, t_scale=1.0)
     errors = 3 * machine.sigma * np.random.default_rng(2).standard_normal(len(machine.names))

@@ -97,7 +97,7 @@ def test_nearly_exact_centres_give_the_mount_as_nearly():
     assert max(abs(e) for e in errors_of(calibration, run).values()) < 1e-5
 
 
-def test_table1_rows_stand_beside_their_printed_numbers():
+def test_table1_rows_are_beside_their_printed_numbers():
     case = table1.Case(magnification=5.3, n=2)
     content = {
         side: {

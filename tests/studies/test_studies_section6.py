@@ -1,4 +1,4 @@
-"""Section 6 in pieces: path lengths, radiographs, what is measured, and a tiny run that goes on where it stopped."""
+"""Section 6 in pieces: path lengths, radiographs, what is measured, and a tiny run that continues where it stopped."""
 
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ def test_cases_have_names_of_their_own_and_order_is_looked_at_once():
     assert [c.order for c in cases if c.order] == ["sequential", "golden"]
 
 
-def test_a_tiny_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
+def test_a_tiny_run_continues_where_it_stopped(tmp_path, monkeypatch):
     steps = Steps(folder=tmp_path, key={"study": "section6"})
     solved: dict[tuple[float, int], object] = {}
 

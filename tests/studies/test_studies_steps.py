@@ -1,4 +1,4 @@
-"""Kept steps: an interrupted study goes on with the same numbers, and never with another study's."""
+"""Kept steps: an interrupted study continues with the same numbers, and never with another study's."""
 
 from __future__ import annotations
 

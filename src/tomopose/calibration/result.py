@@ -179,7 +179,7 @@ class Calibration:
         if np.shape(self.covariance) != (m, m):
             raise ShapeError(f"covariance is {np.shape(self.covariance)} but {m} coordinates are named")
         if self.arrangement not in ARRANGEMENTS:
-            raise ShapeError(f"arrangement {self.arrangement!r} is none of {', '.join(ARRANGEMENTS)}")
+            raise ShapeError(f"arrangement {self.arrangement!r} is not one of {', '.join(ARRANGEMENTS)}")
         object.__setattr__(self, "balls", {int(k): float_array(v) for k, v in self.balls.items()})
         for name in ("covariance", "x_D", "residuals"):
             object.__setattr__(self, name, float_array(getattr(self, name)))

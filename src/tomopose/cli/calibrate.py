@@ -81,7 +81,7 @@ class CalibrationOptions(ObservedOptions, SpokenOptions):
         typer.Option(
             "--arrangement",
             help="What the manipulator carries: moving-object, or moving-scanner (source "
-            "and detector; C-arm, gantry), where the ball stands still.",
+            "and detector; C-arm, gantry), where the ball does not move.",
         ),
     ] = "moving-object"
     distance_sigma: Annotated[

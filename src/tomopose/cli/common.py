@@ -68,7 +68,7 @@ def speak_any_terminal() -> None:
 
 
 def tell(text: str) -> None:
-    """A line for people on standard error; where nobody listens any more, the work goes on."""
+    """A line for people on standard error; where the stream is closed, the work continues."""
     with contextlib.suppress(OSError, ValueError):
         print(text, file=sys.stderr, flush=True)
 

@@ -29,7 +29,7 @@ def register(app: typer.Typer) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Options(CalibrationOptions):
-    """The options of `tomopose diagnose`: those of `calibrate` but for the folder."""
+    """The options of `tomopose diagnose`: those of `calibrate` except for the folder."""
 
 
 def answer(found: Diagnosis) -> str:

@@ -51,7 +51,7 @@ class Found:
 
 
 def init(options: Options) -> int:
-    """Start a project: tomopose.toml says once what every verb would be told each time.
+    """Start a project: tomopose.toml states once what every verb needs.
 
     Files of a scanner, of poses and of images are recognised; scanner.json and poses.csv are written from them.  On a
     terminal, what is missing is asked for.
@@ -110,7 +110,7 @@ def look_at(o: Options) -> Found:
         elif poses:
             take_poses(path, found)
         if not scanner and not poses:
-            take_poses(path, found)  # raises, and says what the file is and how to go on
+            take_poses(path, found)  # raises, and says what the file is and how to proceed
     if spare and "poses" not in found.values:
         take_poses(spare[0], found)
     if o.images is not None:

@@ -32,7 +32,7 @@ def numbers(text: str, option: str) -> tuple[float, ...]:
     try:
         return tuple(float(part) for part in names(text))
     except ValueError:
-        raise typer.BadParameter(f"{text!r} is no list of numbers", param_hint=option) from None
+        raise typer.BadParameter(f"{text!r} is not a list of numbers", param_hint=option) from None
 
 
 @dataclass(frozen=True, kw_only=True)

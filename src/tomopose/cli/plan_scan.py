@@ -64,7 +64,7 @@ def scan(
         )
         sequence = tilted_scan(views, wave, R_HT=R_HT, pivot=pivot)
     else:
-        raise typer.BadParameter(f"{shape!r} is none of circular, triangle, sine", param_hint="--shape")
+        raise typer.BadParameter(f"{shape!r} is not one of circular, triangle, sine", param_hint="--shape")
     summary: dict[str, object] = {"out": out.name, "views": len(sequence), "shape": shape}
     lines = [f"{out}: {len(sequence)} views, {shape}"]
     if object_radius is not None and object_height is not None:

@@ -153,7 +153,7 @@ def current_facts() -> dict[str, str]:
 
 
 def find_project(given: str | None, folder: Path) -> Project | None:
-    """The project file that is asked for, or the one of the working folder; None where there is none."""
+    """The project file that is asked for, or the one of the working folder; None if none is found."""
     if given is not None:
         return read_project(Path(given))
     path = folder / NAME

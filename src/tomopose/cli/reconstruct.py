@@ -24,7 +24,7 @@ EPILOG = (
 
 PICTURES = ("slice_z", "slice_y", "slice_x", "maximum")
 SWEEPS = ("iterations", "relaxation", "order", "subset_size", "nonnegative")
-"""Options that belong to an algorithm, but for the seed, which the paper does not state."""
+"""Options that belong to an algorithm, except for the seed, which the paper does not state."""
 
 
 def register(app: typer.Typer) -> None:
@@ -105,7 +105,7 @@ class ExecutionOptions:
         Path | None,
         typer.Option(
             "--checkpoint",
-            help="Folder to keep the state in; a second run with the same images and settings goes on from there.",
+            help="Folder to keep the state in; a second run with the same images and settings continues from there.",
         ),
     ] = None
     dask: DaskOption = None

@@ -44,7 +44,7 @@ def simulate(
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> int:
-    """Make radiographs that can stand in for the scanner's.  The same scene and seed give the same bytes."""
+    """Make radiographs that can replace the scanner's.  The same scene and seed give the same bytes."""
     import tomopose as tp
     from tomopose.cli.job import executor_of
     from tomopose.cli.simulated import run_of, write_run
@@ -87,7 +87,7 @@ def with_grids(scene: Scene, grid: str | None, path: Path) -> list[tuple[Scene, 
         raise typer.BadParameter(f"{path} has no grid of poses", param_hint="--grid")
     numbers = names(grid)
     if not numbers or not all(n.isdigit() and int(n) > 0 for n in numbers):
-        raise typer.BadParameter(f"{grid!r} is no list of whole numbers", param_hint="--grid")
+        raise typer.BadParameter(f"{grid!r} is not a list of whole numbers", param_hint="--grid")
     made = []
     for n in numbers:
         poses = scene.poses.model_copy(update={"grid": scene.poses.grid.model_copy(update={"n": int(n)})})

@@ -63,7 +63,7 @@ def write_run(
     progress: Progress | None = None,
 ) -> None:
     """Tables first, then the images one by one: TIFF files, each whole or absent, or the stack of one HDF5 file, which
-    bears another name until it is whole.
+    has another name until it is complete.
 
     truth.json holds the run's key.  Images that are there already stay only where it is this run's (`resume`); those of
     another run are removed before anything of this one is written, so that the folder never mixes two.
@@ -158,7 +158,7 @@ def clear_another_run(out: Path, key: Key, *, force: bool) -> None:
 
 
 def _told(made: Iterator[tuple[int, Any]], done: int, n: int, told: Progress) -> Iterator[tuple[int, Any]]:
-    """The same frames; each is told of once the next is asked for, when it is written."""
+    """The same frames; each is reported once the next is asked for, when it is written."""
     for finished, frame in enumerate(made, start=done + 1):
         yield frame
         told(finished, n)

@@ -41,7 +41,7 @@ def study(
 ) -> int:
     """Run a study: printed, ours by the paper's method, ours by our best; as JSON, page and pictures.
 
-    An interrupted study goes on where it stopped when it is called again with the same folder, seed and scale.  Exit
+    An interrupted study continues where it stopped when it is called again with the same folder, seed and scale.  Exit
     code 3 where a statement that the study tests does not hold.
     """
     from tomopose.files import require_absent

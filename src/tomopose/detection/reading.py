@@ -130,7 +130,7 @@ def _bad_pixels(values: Array, mask: Mask, box: Box) -> npt.NDArray[np.bool_] | 
     v0, v1, u0, u1 = box
     bad = None
     if values.dtype.kind == "f":
-        # One sum tells whether all are finite, without an array of answers.
+        # One sum shows whether all are finite, without an array of answers.
         with np.errstate(all="ignore"):
             if not math.isfinite(float(np.sum(values, dtype=np.float64))):
                 bad = ~np.isfinite(values)

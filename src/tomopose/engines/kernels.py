@@ -81,7 +81,7 @@ class Work(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _clip_range(low: float, high: float, a: float, b: float) -> tuple[float, float]:
-    """The part of (low, high) where a + b z > 0; empty, high <= low, where there is none or a is NaN."""
+    """The part of (low, high) where a + b z > 0; empty, high <= low, where there is no such part or a is NaN."""
     if b > 0.0:
         low = max(low, -a / b)
     elif b < 0.0:
@@ -158,7 +158,7 @@ def _back_column_vector(
         return
     middle = 0.5 * (z_0 + z_1 - 1)
     w = a_w + P[2, 2] * middle
-    # Counting from a pixel near the column's middle keeps the float32 quotients of a block small, hence exact.
+    # Counting from a pixel near the column's middle keeps the float32 quotients of a block small, therefore exact.
     reciprocal = 1.0 / w
     u_ref = math.floor(min(max((a_u + P[0, 2] * middle) * reciprocal, -1.0), float(n_u)))
     v_ref = math.floor(min(max((a_v + P[1, 2] * middle) * reciprocal, -1.0), float(n_v)))

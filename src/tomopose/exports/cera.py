@@ -48,8 +48,8 @@ def to_cera(
 ) -> tuple[str, str]:
     """The .config text and the table's text.  `image_rows`: row 0 of the image files ("top" is the TIFF order).
 
-    Any matrix fits, skewed and mirrored ones too; what CERA makes of those is not known.  `date`: stands in the table;
-    now where it is not given.
+    Any matrix fits, skewed and mirrored ones too; what CERA makes of those is not known.  `date`: is written in the
+    table; now where it is not given.
     """
     n, p_u, p_v = len(matrices), float(matrices.p_u), float(matrices.p_v)
     config = f"""#CERACONFIG

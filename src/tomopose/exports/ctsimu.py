@@ -1,7 +1,7 @@
-"""CTSimU scenario, file format 1.2, written: source and panel stand still, the stage carries the scan.
+"""CTSimU scenario, file format 1.2, written: source and panel do not move, the stage carries the scan.
 
 Source at 0, panel at x = d_SD, both with vector_u = (0, -1, 0) and vector_w = (1, 0, 0), so that the panel's v points
-down.  With Q the rotation whose rows are (m3, -U/p_u, V/p_v), from W to these axes, the stage stands at -Q S with axes
+down.  With Q the rotation whose rows are (m3, -U/p_u, V/p_v), from W to these axes, the stage is at -Q S with axes
 (u, v, w) = (-Q e_x, -Q e_y, Q e_z).  The stage's centre moves by drifts, its orientation by three deviations about
 w, v, u (turning axes) with drifts; one drift value a frame, so nothing is interpolated.  Where d_SD or the piercing
 point change from view to view, the panel's centre drifts too.  Reading is in ctsimu_scenario.py.

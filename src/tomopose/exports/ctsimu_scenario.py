@@ -1,7 +1,7 @@
-"""CTSimU scenarios 1.0 to 1.2, read: where source, panel and stage stand in every frame, as a reconstruction knows it.
+"""CTSimU scenarios 1.0 to 1.2, read: where source, panel and stage are in every frame, as a reconstruction knows it.
 
 Per frame and part: the standard pose, the stage's turn about w between start and stop angle, the deviations in their
-order (about world axes x, y, z or the part's own axes u, v, w as they then stand), and at last the drift of the centre.
+order (about world axes x, y, z or the part's own axes u, v, w as they then are), and at last the drift of the centre.
 Only what is `known_to_reconstruction` counts.  A list of drift values, in the scenario or in a file that it names, is
 stretched over the scan and interpolated linearly.  A parameter that is null is not relevant: the toolbox counts it as
 0, and so does this reader, where the geometry can do without it.  W is the stage turned by 180 degrees about its w
@@ -133,7 +133,7 @@ def stage_angles(acquisition: Mapping[str, Any], n: int, where: str) -> Array:
     if direction not in ("CCW", "CW"):
         raise InputError(f"{where}: acquisition.direction is {direction!r}; 'CCW' or 'CW' is needed")
     if stop < start:
-        raise InputError(f"{where}: acquisition.stop_angle lies before start_angle; the sense stands in 'direction'")
+        raise InputError(f"{where}: acquisition.stop_angle lies before start_angle; the sense is given by 'direction'")
     if stop > start and not isinstance(final, bool):
         raise InputError(f"{where}: acquisition.include_final_angle is {final!r}; true or false is needed")
     steps = n - 1 if final else n
@@ -283,7 +283,7 @@ def _is_known(json: Mapping[str, Any], where: str) -> bool:
 
 
 def _list(json: Any, where: str, *, alone: Any = Mapping) -> list[Any]:
-    """A list, of one where a single entry of that kind stands alone; none at all is an empty list."""
+    """A list, of one where a single entry of that kind is alone; none at all is an empty list."""
     if json is None or isinstance(json, list):
         return json or []
     if isinstance(json, alone):

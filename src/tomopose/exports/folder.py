@@ -143,7 +143,7 @@ FORMATS: Mapping[str, Format] = {
     ),
     "ctsimu": Format(
         write=lambda folder, m, rows: _text(folder, {"ctsimu.json": _json_text(to_ctsimu(m))}),
-        contents="scenario, file format 1.2: source and panel stand still, the stage carries the poses",
+        contents="scenario, file format 1.2: source and panel do not move, the stage carries the poses",
         load="ctsimu.scenario.Scenario('ctsimu.json'); set_frame(i, reconstruction=True)",
         row0="bottom",
         rows_note="the matrices count v upwards; the format's image files have their top row first",

@@ -56,7 +56,7 @@ class Reader:
 
 
 def _keyed(format: str, key: str, read: Callable[..., ProjectionMatrices]) -> Reader:
-    """A format of named arrays, told by one of its keys."""
+    """A format of named arrays, recognised by one of its keys."""
 
     def reading(source: Source, given: Given) -> ProjectionMatrices:
         return read(source.require(Mapping, format), given, where=str(source.path))
@@ -169,7 +169,7 @@ READERS: Mapping[str, Reader] = {
         read=lambda s, given: from_matrices(s.content, given, where=str(s.path)),
     ),
 }
-"""Format -> reader, most telling first."""
+"""Format -> reader, most specific first."""
 
 
 def format_of(content: Any) -> str | None:

@@ -180,7 +180,7 @@ def _homogeneous(R: Array) -> Array:
 
 
 def _views(text: str, where: str) -> list[dict[str, Any]]:
-    """Per view its parameters and, where it has one, its matrix.  As in RTK, values stand until they are replaced."""
+    """Per view its parameters and, where it has one, its matrix.  As in RTK, values hold until they are replaced."""
     if "<!ENTITY" in text:
         raise InputError(f"{where} defines XML entities; a geometry needs none, it is not read")
     try:

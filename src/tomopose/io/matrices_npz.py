@@ -101,7 +101,7 @@ def read_matrices(path: str | Path) -> ProjectionMatrices:
 
 @reader("matrices.npz")
 def read_matrices_provenance(path: str | Path) -> Provenance | None:
-    """The provenance that stands in matrices.npz, or None."""
+    """The provenance in matrices.npz, or None."""
     content = _load(Path(path))
     if "provenance" not in content:
         return None

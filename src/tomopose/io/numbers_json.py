@@ -35,5 +35,5 @@ def decode_array(value: Any, *shape: int) -> Array:
 
 def _exactly(array: Array, shape: tuple[int, ...]) -> Array:
     if array.shape != tuple(n if n >= 0 else array.shape[k] for k, n in enumerate(shape)):
-        raise ValueError(f"an array of shape {array.shape} stands where {shape} is needed")
+        raise ValueError(f"an array of shape {array.shape} is given where {shape} is needed")
     return array

@@ -22,7 +22,7 @@ TABLE_TOLERANCE_RAD = np.radians(0.1)
 
 
 def pair_images(poses: PoseSequence, images: ImageSequence | Sequence[str]) -> Indices:
-    """For each pose the index (n,) of its image: `images.select(pair_images(poses, images))` stands in pose order.
+    """For each pose the index (n,) of its image: `images.select(pair_images(poses, images))` is in pose order.
 
     With an `image` column images are picked by name, and images that no row names are left out.  Without it the counts
     must agree, and they pair

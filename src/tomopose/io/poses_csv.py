@@ -1,4 +1,4 @@
-"""poses.csv: where the manipulator was told to go and where its encoders say it stood."""
+"""poses.csv: the commanded poses of the manipulator and those of its encoders."""
 
 from __future__ import annotations
 
@@ -246,7 +246,8 @@ def _pose(table: TextTable, convention: Convention, *, commanded: bool, confirme
 
 
 def _orientations(table: TextTable, convention: Convention) -> Array | None:
-    """(n, 3 or 4) the orientation columns of the poses that are used, as written; None where there are none."""
+    """(n, 3 or 4) the orientation columns of the poses that are used, as written; None where there are no such
+    values."""
     for commanded in (False, True):
         columns = pose_columns(convention, commanded=commanded)[len(POSITION) :]
         if all(c in table.columns for c in columns):
@@ -266,8 +267,8 @@ def _require_different(table: TextTable, column: str, cells: Sequence[object]) -
         rows = [i for i, cell in enumerate(cells) if cell == twice[0][0]][:2]
         name = twice[0][0][0] if isinstance(twice[0][0], tuple) else twice[0][0]
         raise InputError(
-            f"{table.path}: {column} {name!r} stands in rows {rows[0] + 1} and {rows[1] + 1} "
-            f"({len(twice)} repeat); each may stand once"
+            f"{table.path}: {column} {name!r} appears in rows {rows[0] + 1} and {rows[1] + 1} "
+            f"({len(twice)} repeat); each may appear once"
         )
 
 

@@ -28,7 +28,7 @@ in degrees."""
 PITCH_RANGE = (4.5e-4, 10.0)
 """mm; 0.2 mm is 0.0002 in metres and 200 in micrometres."""
 DISTANCE_RANGE = (5.0, 1.0e5)
-CURE = 'if it is right, say so with "units": "confirmed"'
+IF_RIGHT = 'if it is right, say so with "units": "confirmed"'
 
 
 @reader("scanner.json")
@@ -67,7 +67,7 @@ def scanner_from_document(document: Mapping[str, Any], where: str) -> Scanner:
             values[key] = document[key]
     units = document.get("units")
     if units not in (None, "confirmed"):
-        raise InputError(f'{where}: units is {units!r}; only "confirmed" is known, the units stand in the keys')
+        raise InputError(f'{where}: units is {units!r}; only "confirmed" is known, the keys state the units')
     if units is None:
         _require_units(values, where)
     try:
@@ -157,12 +157,12 @@ def _require_units(values: Mapping[str, float], where: str) -> None:
         value = values[name]
         if 0 < value < low or value > high:
             guess = "metres" if value < low else "micrometres"
-            raise UnitError(f"{where}: {name}_mm is {value:g}; is it in {guess}? Convert it to mm; {CURE}")
+            raise UnitError(f"{where}: {name}_mm is {value:g}; is it in {guess}? Convert it to mm; {IF_RIGHT}")
     for name in ("eta", "theta", "phi", "axis_tilt_x", "axis_tilt_y"):
         value = values.get(name, 0.0)
         off = value - np.pi / 2 * round(value / (np.pi / 2)) if name == "eta" and abs(value) < 4 else value
         if abs(off) > LARGEST_ROLL:
             raise UnitError(
                 f"{where}: {name}_rad is {value:g}, which would be {math.degrees(value):.4g} deg; is it in degrees? "
-                f"Convert it to rad; {CURE}"
+                f"Convert it to rad; {IF_RIGHT}"
             )

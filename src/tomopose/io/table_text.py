@@ -64,7 +64,7 @@ class TextTable:
     def numbers(self, column: str, *, blank: Sequence[bool] | None = None) -> Array:
         """A column as numbers (n,).  Rows where `blank` is true may be blank or nan, and give nan.
 
-        Raises InputError, naming row and column, for blank, nan, inf, text, and stand-ins such as 9999.
+        Raises InputError, naming row and column, for blank, nan, inf, text, and placeholders such as 9999.
         """
         k = self.columns.index(column)
         values = np.empty(len(self.rows))
@@ -89,7 +89,7 @@ class TextTable:
         if not NUMBER.fullmatch(cell):
             raise InputError(f"{self.where(row, column)}: {cell!r} is no finite number")
         if PLACEHOLDER.fullmatch(cell):
-            raise InputError(f"{self.where(row, column)}: {cell} stands for a missing value; leave the row out")
+            raise InputError(f"{self.where(row, column)}: {cell} denotes a missing value; leave the row out")
         value = float(cell)
         if not np.isfinite(value):
             raise InputError(f"{self.where(row, column)}: {cell!r} is too large for a number")

@@ -2,7 +2,7 @@
 
 A file's column names say its units; a person may still have pasted other numbers below them.  These checks refuse what
 is far more likely a mistake than a measurement, and every one can be answered: `# units: confirmed` in the table,
-`"units": "confirmed"` in a JSON file, or `units_confirmed=True` in the call.  docs/formats/files.md tells the rules.
+`"units": "confirmed"` in a JSON file, or `units_confirmed=True` in the call.  docs/formats/files.md states the rules.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def require_one_unit(positions: Array, angles: Array | None, where: str) -> None
 
 
 def _row_in_other_unit(values: Array, factor: float, at_most: float, noise: float) -> int | None:
-    """The first row all of whose values, times the factor, are levels of other rows but are none as they stand."""
+    """The first row all of whose values, times the factor, are levels of other rows but are not as written."""
     size = np.abs(values).max(axis=1, initial=0.0)
     small = (size < at_most) & (size > noise)
     levels = [values[~small & (np.abs(column) > at_most), k] for k, column in enumerate(values.T)]

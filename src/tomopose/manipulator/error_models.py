@@ -2,7 +2,7 @@
 
 `Calibration.errors` is one of four types, and there are no others:
 
-    RigidErrors       the poses are trusted, but for a scale of their translations and a scatter;
+    RigidErrors       the poses are trusted, except for a scale of their translations and a scatter;
     IdentifiedErrors  a hexapod or a robot with the errors of its geometry that were found;
     EmpiricalErrors   a smooth map of pose errors, for machines whose kinematics nobody knows;
     TwinErrors        two robots, of source and of detector.
@@ -205,8 +205,8 @@ class PoseCorrection:
 
 
 def machines_of(errors: Errors) -> tuple[ErrorModel | None, ErrorModel | None]:
-    """The nominal machines, without errors: the manipulator's, or those of detector and source of twins; None where
-    there is none."""
+    """The nominal machines, without errors: the manipulator's, or those of detector and source of twins; None for a
+    machine without a model."""
     if isinstance(errors, TwinErrors):
         return errors.detector, errors.source
     if isinstance(errors, RigidErrors):

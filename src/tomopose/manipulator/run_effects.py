@@ -1,4 +1,4 @@
-r"""What happened during one run and is no part of the machine's geometry: drift with its warmth, lag of its drives.
+r"""What happened during one run and is not part of the machine's geometry: drift with its warmth, lag of its drives.
 
     (w, s) = sum_i c_i P_i(tau)  -  sum_c lag_c sign_c e_c  -  sum_d lag_d sign_d J_d
 

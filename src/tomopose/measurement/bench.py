@@ -232,7 +232,7 @@ def by_reference(feature: Feature, reference: Association) -> Feature:
 
 
 def refitted(feature: Feature, points: Array) -> Feature:
-    """The feature fitted again to points (n, 3) that stand for its used ones, about where it was, by its own criterion:
+    """The feature fitted again to points (n, 3) that represent its used ones, about where it was, by its own criterion:
     no outlier rule, no correlation, radius held where it was held."""
     return by_reference(_least_squares(feature, points), feature.association)
 

@@ -5,12 +5,12 @@
     calibration   of the manipulator, propagated through the projection matrices
     simulation    standard deviation over virtual scans, and their mean error (JCGM 101)
 
-Scans that repeat scatter by the noise that the fit states, and by more: the larger of both stands for the two.  To it
+Scans that repeat scatter by the noise that the fit states, and by more: the larger of both covers the two.  To it
 the calibration's share is added in squares, since one calibration serves all repeats.  What all scans have in common
 (what is not linear in the attenuation, artefacts, the mean over a pixel) is in none of the three.
 
 A simulation holds noise, places within voxels and, where it drew them, calibrations, and its mean error is that common
-part.  It therefore stands for all: the errors of n virtual scans, of standard deviation s, say that the next one lies
+part.  It therefore covers all: the errors of n virtual scans, of standard deviation s, say that the next one lies
 within
 
     e_mean +- t(n - 1) s sqrt(1 + 1 / n)
@@ -155,7 +155,7 @@ def repeat_of(group: str, rows: Sequence[MeasurementResult]) -> Repeat:
     mean, s = float(values.mean()), float(values.std(ddof=1))
     finite = [(r.u, r.dof) for r in rows if math.isfinite(r.u)]
     u_fit = float(np.mean([u for u, _ in finite])) if finite else 0.0
-    # The spread of repeats holds the fit's noise already; the larger of the two stands for both.
+    # The spread of repeats holds the fit's noise already; the larger of the two covers both.
     own = (s, n - 1.0) if s >= u_fit else (u_fit, float(sum(dof for _, dof in finite)))
     stated = value_shares(first)
     b = None if first.reference is None or not first.calibrated else mean - first.reference

@@ -1,6 +1,6 @@
 """Would these poses show a wrong convention?  Every alternative is fitted to the exact centres of the planned poses.
 
-Where one would pass, the poses that tell it best are those at which its best fit to the plan is farthest from the truth
+Where one would pass, the poses that show it best are those at which its best fit to the plan is farthest from the truth
 (T-optimality: Atkinson and Fedorov, Biometrika 62 (1975) 57); the plan is made again with such poses in it.
 """
 
@@ -44,9 +44,9 @@ class Resolvability:
         lines = []
         if self.unresolved:
             remedy = (
-                "another table angle, a quarter turn away, would tell"
+                "another table angle, a quarter turn away, would show it"
                 if self.still
-                else ("other table angles, more images or longer travel would tell")
+                else ("other table angles, more images or longer travel would show it")
             )
             names = ", ".join(f"{h.name} (delta chi2 {h.delta:.2g} of {BETTER:g})" for h in self.unresolved)
             lines.append(f"these poses would not show: {names}; {remedy}")

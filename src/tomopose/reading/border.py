@@ -67,7 +67,7 @@ def reader(what: str, *, folder: bool = False) -> Callable[[Callable[P, R]], Cal
 
 
 def as_path(path: object, what: str) -> Path:
-    """The path; InputError for anything that is none, FileError for an empty one."""
+    """The path; InputError for anything that is not a path, FileError for an empty one."""
     if not isinstance(path, (str, os.PathLike)):
         raise InputError(f"the {what} is read from a file; a {type(path).__name__} was given instead of its path")
     if os.fspath(path) == "":

@@ -16,7 +16,7 @@ SHARE_OF_FREE = 0.8
 
 
 def available_bytes() -> int | None:
-    """Memory that is free for this process, in bytes, where the system tells; None elsewhere.
+    """Memory that is free for this process, in bytes, where the system reports it; None elsewhere.
 
     The least of the machine's free memory, the control group's and this process's own limit.
     """

@@ -1,4 +1,4 @@
-"""State of an unfinished reconstruction, so that a killed one goes on and ends with the same numbers."""
+"""State of an unfinished reconstruction, so that a killed one continues and ends with the same numbers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NAME = "reconstruction-checkpoint"
 
 
 class Checkpoint:
-    """Saves the field into `folder` after an update, at most every `seconds`, and says where to go on.
+    """Saves the field into `folder` after an update, at most every `seconds`, and says where to continue.
 
     key.json holds the key of what the numbers depend on: images, matrices, grid, settings, version.  Two generations
     alternate: state.json names the whole one, and is replaced only once the other is whole.

@@ -2,7 +2,7 @@
 
 Each reading (as given, rows flipped, columns mirrored ...) is reconstructed from a few binned views and reprojected.
 The reading that the data contradict least is the right one; where several do equally well the object or the path is too
-symmetric to tell, and nothing is claimed.
+symmetric to decide, and nothing is claimed.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ class Agreement:
 
     @property
     def suspicious(self) -> tuple[int, ...]:
-        """The views whose residual stands out from the others'."""
+        """The views whose residual is far above the others'."""
         median = float(np.median(self.residual))
         spread = 1.4826 * float(np.median(np.abs(self.residual - median)))
         limit = median + SUSPICIOUS * max(spread, 0.02 * median, 1e-6)
@@ -85,7 +85,7 @@ def agreement_of(
         outside[j] = (p[beside] ** 2).sum() / max(float((p**2).sum()), 1e-300)
     with np.errstate(divide="ignore", invalid="ignore"):
         residual = np.where(size > 0, np.sqrt(apart / size), 0.0)
-        # The reprojection bears at most as much noise as the image.
+        # The reprojection has at most as much noise as the image.
         left = np.maximum(apart - 2 * noise, 0.0)
         unexplained = np.sqrt(left / np.maximum(size, max(FAINT**2 * float(np.median(size)), 1e-300)))
     return Agreement(residual=residual, unexplained=unexplained, outside=outside)

@@ -273,7 +273,7 @@ def beam_hardening_polynomial(
 def ring_offset(scan: LineIntegrals, *, width: int = 15) -> np.ndarray:
     """(n_v, n_u): what each pixel reads too high on average over all views, against a median over `width` pixels.
 
-    A fault of a pixel stands still on the detector while the object moves, so that it shows in the mean of all views.
+    A fault of a pixel stays in place on the detector while the object moves, so that it shows in the mean of all views.
     """
     if width < 3 or width % 2 == 0:
         raise InputError(f"the ring filter's width is {width}; an odd number of pixels from 3 on is needed")

@@ -41,7 +41,7 @@ def sampling_stride(matrices: ProjectionMatrices) -> int:
 
 
 def available_bytes() -> int | None:
-    """Memory that is free for this process, where the system tells; None elsewhere."""
+    """Memory that is free for this process, where the system reports it; None elsewhere."""
     try:
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):

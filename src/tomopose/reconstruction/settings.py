@@ -127,7 +127,7 @@ class Execution:
     memory_gib:  memory to keep within; what is free unless given.
     scratch:     folder for the slabs of a volume that does not fit.
     checkpoint, checkpoint_seconds: folder in which the state is kept, at most that often (0: after every update); a
-                 second call with the same images, matrices and settings goes on from there.
+                 second call with the same images, matrices and settings continues from there.
     client:      a dask.distributed client: its workers hold the volume in slabs.
     slabs:       number of slabs; as many as needed, or one a worker, unless given.
     engine_options: what the engine takes: threads, kernels (cpu).

@@ -73,7 +73,7 @@ def checks_of(a: dict[str, float], b: dict[str, float], best: dict[str, float], 
     """Homogeneous in (a), y far above the rest in (b), and homogeneous again by our best."""
     return [
         check_below(
-            "(a) by the paper's method no rotation stands out (largest over smallest rms)",
+            "(a) by the paper's method no rotation is prominent (largest over smallest rms)",
             max(a.values()) / min(a.values()),
             1.5,
             "x",
@@ -89,7 +89,7 @@ def checks_of(a: dict[str, float], b: dict[str, float], best: dict[str, float], 
             "px",
         ),
         check_between("(b) by the paper's method rotations about z are as printed, 0.144 px", b["z"], 0.11, 0.18, "px"),
-        check_below("(b) by our best no rotation stands above 1.5 x the floor", max(best.values()) / floor, 1.5, "x"),
+        check_below("(b) by our best no rotation is above 1.5 x the floor", max(best.values()) / floor, 1.5, "x"),
     ]
 
 
@@ -140,14 +140,14 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
         by_pose(
             "Fig. 8 (a): perfect manipulator",
             "d_k by the paper's method from simulated radiographs.",
-            "No colour stands out: only the detection's own error is left.",
+            "No colour is prominent: only the detection's own error is left.",
             a.d,
             poses,
         ),
         by_pose(
             "Fig. 8 (b): manipulator that errs",
             "d_k by the paper's method, the virtual hexapod.",
-            "Rotations about y stand far above the rest.",
+            "Rotations about y are far above the rest.",
             b.paper_method.d,
             poses,
         ),

@@ -46,7 +46,7 @@ def run_study(
     name:     a key of PAPER.
     scale:    "small": minutes at most, same physics, fewer poses; "paper": the paper's full plan.
     seed:     of all random numbers; the same seed gives the same numbers.
-    folder:   where steps are kept, so that an interrupted run goes on; None keeps none.
+    folder:   where steps are kept, so that an interrupted run continues; None keeps none.
     progress: called with (done, total).
 
     Raises InputError for an unknown name or scale.

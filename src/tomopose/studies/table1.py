@@ -45,12 +45,12 @@ QUESTION = (
 )
 NOTES = (
     "The paper simulates with another program and its detector's code is not published: edge pixels of Canny's "
-    "detector, the direct ellipse fit and the exact correction of the centre stand in for it. Its d_rms comes from "
+    "detector, the direct ellipse fit and the exact correction of the centre replace it. Its d_rms comes from "
     "edge points that are whole pixels, so noise hardly changes it.",
     "Radiographs are simulated in a window around the ball at full resolution, with photon noise of a signal-to-noise "
     "ratio of 200 in the open beam, which the paper does not print.",
     "Angles are compared by the rotation vector of R_HT R_HT,exact^T, not by subtracting Euler angles; for these small "
-    "errors the two agree but for the sign conventions of the axes.",
+    "errors the two agree except for the sign conventions of the axes.",
     "The signs of single errors are chance: another seed gives others of the same size.",
 )
 

@@ -66,7 +66,7 @@ def simulated_errors(
     options:     of `reconstruct`, such as algorithm and iterations.
 
     Where the calibration holds errors of the manipulator, their covariance is drawn too.  Where the scene's manipulator
-    errs, its plate is then believed to stand where the calibration puts it, else where it was sent.
+    errs, its plate is then taken to be where the calibration puts it, otherwise where it was commanded.
 
     The truth is the plan's nominal value (calibrated distances and diameters for a multi-sphere standard); without one
     the error is that from the mean of the draws, and its mean is nan.  Raises InputError for too few draws or for a
@@ -183,7 +183,7 @@ def _require_same_detector(own: Scanner, calibration: Calibration) -> None:
 
 
 def _drawn_poses(run: SimulatedRun, calibration: Calibration, delta: Array) -> RigidTransform:
-    """Where the plate is believed to stand, after a step delta in the manipulator's errors."""
+    """Where the plate is taken to be, after a step delta in the manipulator's errors."""
     if isinstance(calibration.errors, RigidErrors):
         return run.poses.T_MH
     fixed = correction(calibration.errors, run.poses)

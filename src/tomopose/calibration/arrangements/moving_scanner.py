@@ -1,4 +1,4 @@
-"""Calibration where source and detector move and the ball stands still; d_SD fixed, or one more number a view."""
+"""Calibration where source and detector move and the ball does not move; d_SD fixed, or one more number a view."""
 
 from __future__ import annotations
 
@@ -50,18 +50,20 @@ def calibrate_inverse(
     Returns
     -------
     A calibration whose T_HT is the mount (moved plate -> T) and whose ball is given in the base.  Matrices of a scan:
-    `projection_matrices(calibration, inverse_poses(scan))`; their points are points of the standing object.
+    `projection_matrices(calibration, inverse_poses(scan))`; their points are points of the fixed object.
 
     Raises
     ------
     As `calibrate`; NotObservableError for what says only where W begins.
     """
     if np.asarray(poses.alpha).any():
-        raise InputError("the arrangement with a standing object has no rotary table; alpha must be 0 in every pose")
+        raise InputError("the arrangement with a fixed object has no rotary table; alpha must be 0 in every pose")
     if not (np.isfinite(d_SD_sigma) and d_SD_sigma >= 0):
         raise InputError(f"d_SD_sigma is {d_SD_sigma}; a standard deviation >= 0 in mm is needed")
     if d_SD_sigma and model == "slack":
-        raise InputError("a d_SD that differs from view to view cannot be told from poses that scatter (model slack)")
+        raise InputError(
+            "a d_SD that differs from view to view cannot be distinguished from poses that scatter (model slack)"
+        )
     free, auto = freed_names(free)
     for name in free:
         if name == "d_SR" or name.startswith("axis"):
@@ -122,8 +124,8 @@ def view_distances(
 ) -> tuple[Array, Array]:
     """(d_SD, u) of each observed view, mm, (n,): its most probable value given the ball's place in that view.
 
-    The ball moves along the line from the piercing point when d_SD changes, so a ball near it tells nothing and u stays
-    d_SD_sigma.  poses: as given to `calibrate_inverse`; rows as in `observations`.
+    The ball moves along the line from the piercing point when d_SD changes, so a ball near it holds no information and
+    u stays d_SD_sigma.  poses: as given to `calibrate_inverse`; rows as in `observations`.
     """
     rows = inverse_poses(poses).select(poses.index_of(observations.pose_id))
     real = corrected_poses(calibration.errors, rows)

@@ -66,7 +66,7 @@ def pose_from_balls(
     spread = np.linalg.svd(balls - balls.mean(axis=0), compute_uv=False)
     if spread[1] < 1e-6 * spread[0]:
         raise NotObservableError(
-            "the balls stand in a line: a turn about it moves none of them",
+            "the balls are in a line: a turn about it moves none of them",
             direction="turn about the balls' line",
             singular_values=spread.tolist(),
         )
@@ -185,7 +185,7 @@ def self_calibrated_balls(
 
     distances: (row, row) -> (distance, standard uncertainty), mm; ball_sigma: mm, how far the coarse coordinates may be
     off.  Without a distance the object's size is known only as well as ball_sigma: radiographs of one scanner position
-    cannot tell a large object far away from a small one near.
+    cannot distinguish a large object far away from a small one near.
     """
     balls = np.array(balls, dtype=np.float64)
     nominal = balls.copy()

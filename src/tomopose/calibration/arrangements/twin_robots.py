@@ -1,4 +1,4 @@
-"""Calibration of twin robots: source and detector each on a robot of its own, the ball stands still."""
+"""Calibration of twin robots: source and detector each on a robot of its own, the ball does not move."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from tomopose.units import Array
 
 MODELS = ("auto", "rigid", "kinematic")
 PANEL = ("p_u", "p_v", "pitch_ratio")
-"""Scanner parameters that twin robots can tell."""
+"""Scanner parameters that twin robots can determine."""
 
 
 def panel_parameters(
@@ -54,7 +54,7 @@ def panel_parameters(
         if name not in UNITS or name in PANEL:
             continue
         if name == "translation_scale":
-            why = "has no meaning for two robots; the tolerances of their links stand in their files"
+            why = "has no meaning for two robots; the tolerances of their links are in their files"
         elif name == "d_SR" or name.startswith("axis"):
             why = "says only where W begins, and no image depends on it"
         else:
@@ -79,7 +79,8 @@ def calibrate_twin(
     distances: Mapping[tuple[int, int], tuple[float, float]] | None = None,
     robust: bool = True,
 ) -> Calibration:
-    """Find the detector's mount, the balls, how the bases stand to each other, the focal spot, and the robots' errors.
+    """Find the detector's mount, the balls, the pose of the bases relative to each other, the focal spot, and the
+    robots' errors.
 
     Parameters
     ----------
@@ -93,13 +94,14 @@ def calibrate_twin(
                   what evidence and held-out poses say.
     free, fix, priors, distances: as in `calibrate`; only p_u, p_v and pitch_ratio can be freed.
 
-    Returns a calibration whose ball stands in the detector robot's base, M; matrices by `twin_matrices`.
-    Raises InputError, NotConvergedError as `calibrate`; NotObservableError for a freed parameter that cannot be told.
+    Returns a calibration whose ball is in the detector robot's base, M; matrices by `twin_matrices`.
+    Raises InputError, NotConvergedError as `calibrate`; NotObservableError for a freed parameter that cannot be
+    determined.
     """
     if model not in MODELS:
         raise InputError(f"unknown model {model!r}; known are {', '.join(MODELS)}")
     if np.asarray(poses.alpha).any():
-        raise InputError("the arrangement with a standing object has no rotary table; alpha must be 0 in every pose")
+        raise InputError("the arrangement with a fixed object has no rotary table; alpha must be 0 in every pose")
     free, _ = freed_names(free)
     others = [name for name in PARAMETER_UNITS if name not in PANEL]
     assumed = assumed_for(scanner, free=free, fix=fix, priors=dict(priors or {}), no_effect=others)
@@ -199,7 +201,7 @@ def _require_panel_known(fit: ModelFit) -> None:
     for name, sigma, own in zip(e.problem.free.names, e.problem.free.sigma, u, strict=False):
         if np.isinf(sigma) and own > MATTERS[name]:
             raise NotObservableError(
-                f"twin robots: these poses tell {name} only to {own:.2g} {unit_of(name)}, worse than the "
+                f"twin robots: these poses determine {name} only to {own:.2g} {unit_of(name)}, worse than the "
                 f"{MATTERS[name]:g} that matter; hold it, or give it a prior standard deviation in scanner.json",
                 direction=name,
             )
@@ -227,7 +229,7 @@ def twin_matrices(
     binning, scanner: as of `projection_matrices`.
     """
     if np.asarray(poses.alpha).any():
-        raise InputError("the arrangement with a standing object has no rotary table; alpha must be 0 in every pose")
+        raise InputError("the arrangement with a fixed object has no rotary table; alpha must be 0 in every pose")
     if scanner is not None:
         require_same_scanner(calibration, scanner)
     _require_both_tables(poses.pose_id, source_poses)
@@ -267,7 +269,7 @@ def twin_notes(calibration: Calibration, poses: PoseSequence, source_poses: Pose
 def view_geometry(
     calibration: Calibration, poses: PoseSequence, source_poses: PoseSequence
 ) -> tuple[Array, Array, Array]:
-    """(d_SD (n,) mm, u_0 (n,) px, v_0 (n,) px): where the focal spot stands before the panel in each view."""
+    """(d_SD (n,) mm, u_0 (n,) px, v_0 (n,) px): where the focal spot is relative to the panel in each view."""
     twin, p = _twin_of(calibration, source_poses)
     P = twin_view_matrices(calibration.scanner, twin, T_HT=calibration.T_HT, poses=inverse_poses(poses), p=p)
     own = ProjectionMatrices(

@@ -457,7 +457,7 @@ def diagnose(
     """Rank some 65 alternative conventions against the declared one.  It never changes an input.
 
     scanner, poses, observations, free, fix, priors: as in `calibrate`, several runs included.
-    moving_scanner: source and detector move and the ball stands still, as in `calibrate_inverse`.
+    moving_scanner: source and detector move and the ball does not move, as in `calibrate_inverse`.
 
     Raises InputError where observations and poses do not pair.
     """

@@ -1,7 +1,7 @@
 """The alternative conventions of the same data: what each would change, and the line of the input that would change.
 
 An alternative is a function from a `Problem` to the `Problem` that would be right if the data had been written in the
-other convention; None where it does not apply to these data.  The readings of the orientation columns stand in
+other convention; None where it does not apply to these data.  The readings of the orientation columns are in
 `orientation_readings`.
 """
 
@@ -297,7 +297,7 @@ def _over_inverse(alternative: Alternative) -> Alternative:
     return replace(
         alternative,
         change=change,
-        words="the object moves and the scanner stands still, or the poses map base to plate",
+        words="the object moves and the scanner does not move, or the poses map base to plate",
         remedy="leave out --arrangement moving-scanner, or poses.csv: invert every pose",
     )
 

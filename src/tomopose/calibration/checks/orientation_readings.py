@@ -1,7 +1,7 @@
 """Other readings of a pose table's orientation columns: angle orders, signs, units, rotation vectors, quaternions.
 
 A table holds three or four numbers a pose.  Which rotation they mean is a declaration; every reading here takes the
-same numbers for another kind of rotation.  Three numbers are named for axes (A, B, C of a KUKA for z, y, x) and stand
+same numbers for another kind of rotation.  Three numbers are named for axes (A, B, C of a KUKA for z, y, x) and are
 in an order, so each reading is tried for the numbers by the axis that names them and in the reversed order.
 """
 

@@ -1,4 +1,4 @@
-"""Did everything stand still?  Drift, change points, repeated poses, and poses predicted without having been fitted.
+"""Did everything keep its place?  Drift, change points, repeated poses, and poses predicted without having been fitted.
 
 The tests are score tests on the whitened residuals r of a fit with Jacobian J: an extra effect with columns C explains
 g^T (C^T C - C^T Q Q^T C)^-1 g of chi2, g = C^T r, Q an orthonormal basis of J; no refit is needed.  Its significance is
@@ -214,7 +214,8 @@ def repeats(problem: Problem, scale: float) -> tuple[RepeatedPose, ...]:
 
 
 def outlier_block(pose_id: tuple[str, ...], keep: Any) -> OutlierBlock | None:
-    """The longest run of at least two neighbours set aside among n rows, keep (n,) bool; None where there is none.
+    """The longest run of at least two neighbours set aside among n rows, keep (n,) bool; None where there is no such
+    value.
 
     p bounds the probability that k outliers, thrown among n rows by chance, hold a run of that length L anywhere:
     (n - L + 1) C(n - L, k - L) / C(n, k).

@@ -32,7 +32,7 @@ class Finding:
 
     def __post_init__(self) -> None:
         if self.verdict not in VERDICTS:
-            raise ShapeError(f"verdict {self.verdict!r} is none of {', '.join(VERDICTS)}")
+            raise ShapeError(f"verdict {self.verdict!r} is not one of {', '.join(VERDICTS)}")
 
 
 def judge(checks: Iterable[Finding]) -> tuple[Verdict, tuple[str, ...]]:

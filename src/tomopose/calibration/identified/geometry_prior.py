@@ -31,7 +31,8 @@ SHARES = (0.04, 0.4, 1.0)
 
 
 def believed(model: ErrorModel | None, share: float) -> ErrorModel | None:
-    """The same machine with its file's geometry doubted by that share of what it states; None where there is none."""
+    """The same machine with its file's geometry doubted by that share of what it states; None where there is no such
+    value."""
     if isinstance(model, (WithRunEffects, InverseManipulator)):
         inner = believed(model.machine, share)
         return None if inner is None else replace(model, machine=inner)

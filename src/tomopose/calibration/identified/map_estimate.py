@@ -7,8 +7,8 @@ errors p).  Minimised is
 
 with C_k the covariance of the observation plus that of the plate's scatter seen through the projection,
 C_k = C_obs,k + f J_pose diag(repeatability) J_pose^T.  The priors sigma_i make the problem well posed: shifts and
-turns of all base joints (or all platform joints) together cannot be told from T_HT (or t), and stay where the prior
-puts them.
+turns of all base joints (or all platform joints) together cannot be distinguished from T_HT (or t), and stay where the
+prior puts them.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class KinematicProblem:
 
     @property
     def prior_sigma(self) -> Array:
-        """Prior standard deviation of each coordinate of theta; inf where there is none."""
+        """Prior standard deviation of each coordinate of theta; inf where there is no limit."""
         flat = np.full(6 + 3 * len(self.data.ball_ids), np.inf)
         return np.concatenate([flat, self.free.sigma, np.zeros(0) if self.model is None else self.model.sigma])
 

@@ -1,6 +1,6 @@
 """Manipulators whose kinematics nobody knows: a scatter for every pose, and a smooth map of pose errors.
 
-Every pose k may stand off its commanded pose by its own small motion with a normal prior.  These slacks never stand
+Every pose k may differ from its commanded pose by its own small motion with a normal prior.  These slacks are never
 among the unknowns: summed out they widen the covariance of the centre, C_k = C_obs,k + f J_pose V J_pose^T, and their
 estimates follow from the residuals, s_k = f V J_pose^T C_k^-1 r_k.  On top, a map of low order holds what is smooth.
 """
@@ -16,8 +16,8 @@ from tomopose.units import Array
 
 LEVER_RANGE_MM = (75.0, 300.0)
 """How far from the plate's origin the joints lie that cause its errors, by a logarithmic prior from a plate's edge to
-its far joints: what turns a size in mm into one in rad where the data do not tell it.  What is stated away from the
-ball follows from it."""
+its far joints: what turns a size in mm into one in rad where the data do not determine it.  What is stated away from
+the ball follows from it."""
 SMALLEST_ERROR_MM = 1e-4
 UNDETERMINED_SHARE = 0.25
 """Share of the prior variance of the plate's turns that may be left before they count as not determined."""

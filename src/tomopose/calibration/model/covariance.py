@@ -17,7 +17,7 @@ WIDENING_PROBABILITY = 0.01
 
 
 def inverse_information(N: Array) -> Array:
-    """N^-1 by its scaled eigenvalues; directions without information get an infinite variance's stand-in, 1e300."""
+    """N^-1 by its scaled eigenvalues; directions without information get 1e300 in place of an infinite variance."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
     value, V = np.linalg.eigh(N * scale[:, None] * scale)
     V = scale[:, None] * V

@@ -47,7 +47,7 @@ class FreeParameters:
     """The freed parameters, in order.
 
     names: as in `Calibration.tangent` (NAME, or NAME[RUN] where it belongs to one of several runs).
-    value: (f,) nominal;  sigma: (f,) prior standard deviation, inf where there is none.
+    value: (f,) nominal;  sigma: (f,) prior standard deviation, inf where there is no limit.
     cols, col_run, factor: where each acts, see `kernel`.
     """
 

@@ -5,7 +5,7 @@ With d the place of the real focal spot and x that of the ball, both in the S of
     u = u_0 - (d_x + l (x - d_x)) / p_u,   v = v_0 + (d_y + l (y - d_y)) / p_v,   l = (d_SD - d_z) / (z - d_z),
 
 eq. (2) for a panel that stays and a source that does not: view by view d_SD - d_z, u_0 - d_x / p_u and v_0 + d_y / p_v
-stand in the place of d_SD, u_0 and v_0.  Both points run through the same chain M -> H -> T -> W -> S.
+take the place of d_SD, u_0 and v_0.  Both points run through the same chain M -> H -> T -> W -> S.
 """
 
 from __future__ import annotations

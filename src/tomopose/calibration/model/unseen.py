@@ -1,7 +1,7 @@
 r"""What a ball cannot see of table and manipulator, but a scan can: directions with a prior and no data.
 
 A scale error of the rotations turns the object too far, and moves a ball as a longer lever would: the fit takes it for
-another t.  A table that wobbles moves nothing while it stands still.  With x = f(theta) + C q + noise, q the errors
+another t.  A table that wobbles moves nothing while it does not move.  With x = f(theta) + C q + noise, q the errors
 with standard deviations sigma, the estimate is off by K q, K = (J^T V^-1 J + P^-1)^-1 J^T V^-1 C, and a scan whose
 pixels change by J_s and S is off by (J_s K - S) q: the "consider" covariance of orbit determination (Schmidt, Adv.
 Control Systems 3 (1966) 293).

@@ -23,7 +23,7 @@ itself known from few runs only needs more (Student's t)."""
 RESIDUAL = "d_rms_px"
 FEWEST_RUNS = 3
 NO_UNCERTAINTY = 1e-6
-"""Of the value: stands for a standard uncertainty that nobody states, so that all scatter is between runs."""
+"""Of the value: represents a standard uncertainty that is not stated, so that all scatter is between runs."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ from tomopose.calibration.rigid.fit import (
     tangent_names,
     whitened2,
 )
-from tomopose.calibration.rigid.observability import cure, unobservable_directions
+from tomopose.calibration.rigid.observability import direction_and_remedy, unobservable_directions
 from tomopose.calibration.rigid.outliers import RobustFit, robust_fit
 from tomopose.calibration.rigid.pose_noise import PoseNoise, estimate_pose_noise, total_covariance
 from tomopose.calibration.rigid.start import closed_form, other_starts, ray_equations
@@ -31,7 +31,7 @@ LIKELY = 2.5
 """A ball on the manipulator is taken to be within this factor of the rotation axis' distance from the focal spot."""
 
 COLLAPSED = 1e-3
-"""A ball nearer to the source than this part of d_SR is none that anybody imaged."""
+"""A ball nearer to the source than this part of d_SR cannot have been imaged."""
 
 POOR_CHI2, POOR_SHARE = 9.0, 2e-3
 """An optimum is suspected to be local when its median residual is 3 sigma and 0.2 % of the centres' spread."""
@@ -84,7 +84,7 @@ def require_observable(problem: Problem, free: FreeParameters, J: Array) -> None
     whitened = np.concatenate([(problem.W @ J).reshape(-1, J.shape[2]), _prior_rows(free, J.shape[2])])
     s, bad = unobservable_directions(whitened, names)
     if bad:
-        direction, remedy = cure(problem, names, bad[-1])
+        direction, remedy = direction_and_remedy(problem, names, bad[-1])
         raise NotObservableError(
             f"the poses do not determine the calibration: {direction}; {remedy}",
             direction=direction,
@@ -107,7 +107,8 @@ def require_no_other_unit(distance: float, d_SR: float) -> None:
 def require_length(problem: Problem, fit: Fit) -> None:
     """NotObservableError where the ball has fallen into the source: without any length an optimum may shrink at will.
 
-    Poses that only turn about one point, as those of an isocentric C-arm do, hold none while the table stands still.
+    Poses that only turn about one point, as those of an isocentric C-arm do, hold no such information while the table
+    does not move.
     """
     scanner = problem.scanners[problem.run[0]]
     source = (scanner.T_WS @ scanner.T_TW(float(problem.alpha[0]))).inv.t

@@ -1,4 +1,4 @@
-"""What the poses can tell, in singular values and in words.
+"""What the poses can determine, in singular values and in words.
 
 A direction counts as unobservable where its predicted standard uncertainty exceeds a size that no longer helps anybody
 (`USELESS`), or where the scaled information matrix is singular within rounding.
@@ -80,7 +80,7 @@ def singular_values(J: Array) -> tuple[Array, Array]:
 
 
 MOST_TERMS = 6
-"""A direction of more coordinates than this is told by their groups: ten balls alone have thirty coordinates."""
+"""A direction of more coordinates than this is named by their groups: ten balls alone have thirty coordinates."""
 
 
 def _group(name: str) -> str:
@@ -116,8 +116,8 @@ def unobservable_directions(J: Array, names: tuple[str, ...]) -> tuple[Array, li
     return s, bad + silent
 
 
-def cure(problem: Problem, names: tuple[str, ...], v: Array) -> tuple[str, str]:
-    """(direction in words, what would cure it)."""
+def direction_and_remedy(problem: Problem, names: tuple[str, ...], v: Array) -> tuple[str, str]:
+    """(direction in words, what would fix it)."""
     words = _words(names, v)
     size = np.abs(v) / scales(names)
     main = {base_name(n) for n, x in zip(names, size, strict=True) if x >= SHOWN * size.max()}
@@ -135,19 +135,19 @@ def cure(problem: Problem, names: tuple[str, ...], v: Array) -> tuple[str, str]:
     if "translation_scale" in scanner_names:
         return f"{words}: only the ratio of lengths is visible", "give a prior on translation_scale or on d_SR"
     if scanner_names:
-        return f"{words}: these poses cannot tell them apart", "add compound rotations, table angles, or a prior"
+        return f"{words}: these poses cannot distinguish them", "add compound rotations, table angles, or a prior"
     if len(moved) and np.abs(moved).max() >= SHOWN * size.max():
         axis = moved[np.abs(moved).max(axis=1).argmax()]
         axis = np.round(axis / np.linalg.norm(axis) * (np.sign(axis[np.abs(axis).argmax()]) or 1.0), 2) + 0.0
         where = f"({axis[0]:.2f}, {axis[1]:.2f}, {axis[2]:.2f})"
         if not rotates:
             return (
-                f"t_HT and t cannot be told apart ({words}): no pose rotates the moved plate",
+                f"t_HT and t cannot be distinguished ({words}): no pose rotates the moved plate",
                 "add poses rotated about two different axes",
             )
         return (
-            f"t_HT and t cannot be told apart along the direction {where} of the moved plate ({words}): the poses turn "
-            "about that axis only",
+            f"t_HT and t cannot be distinguished along the direction {where} of the moved plate ({words}): the "
+            "poses turn about that axis only",
             "add poses rotated about another axis",
         )
     return f"{words} cannot be determined from these poses", "add translations and rotations in other directions"
@@ -183,7 +183,7 @@ def observability(
     names = tangent_names(problem.ball_ids, free)
     whitened = (problem.W @ J).reshape(-1, J.shape[2])
     s, bad = unobservable_directions(whitened, names)
-    pairs = [cure(problem, names, v) for v in bad]
+    pairs = [direction_and_remedy(problem, names, v) for v in bad]
     notes = assumed_report(problem, (problem.W @ J_assumed).reshape(len(whitened), len(assumed)), whitened, assumed)
     return Observability(
         singular_values=s,

@@ -1,6 +1,6 @@
 r"""Pose errors that neighbouring poses share, beside the scatter of single poses.
 
-A robot that is wrong by 0.3 mm is wrong by nearly the same where it stands nearly the same.  Poses close to each other
+A robot that is wrong by 0.3 mm is wrong by nearly the same at nearly the same pose.  Poses close to each other
 then repeat an error instead of averaging it, and a covariance that takes them as independent is too small.  Here a
 pose's error is a random field over the place x_k and the orientation R_k of the moving part:
 
@@ -41,7 +41,7 @@ BOUND = 12.0
 @dataclass(frozen=True, kw_only=True)
 class PoseField:
     """Standard deviations, a coordinate each: of single poses (mm, rad) and of the shared field (mm, rad), its length
-    (mm) and angle (rad), and which part stands still: "H" (the ball moves with M; places are t_MH) or "M" (M is the
+    (mm) and angle (rad), and which part does not move: "H" (the ball moves with M; places are t_MH) or "M" (M is the
     base and H moves, as with a camera or source on a robot; places are those of H's origin in M)."""
 
     translation: float
@@ -54,12 +54,12 @@ class PoseField:
 
 
 def _place(R_MH: Array, t_MH: Array, base: str) -> Array:
-    """(n, 3) mm: where the moving part's origin stands in the base."""
+    """(n, 3) mm: where the moving part's origin is in the base."""
     if base == "H":
         return t_MH
     if base == "M":
         return -(np.swapaxes(R_MH, 1, 2) @ t_MH[:, :, None])[..., 0]
-    raise InputError(f"base is {base!r}; 'H' (the ball moves) or 'M' (the ball stands still) is needed")
+    raise InputError(f"base is {base!r}; 'H' (the ball moves) or 'M' (the ball does not move) is needed")
 
 
 def lever_blocks(b: ProjectionBlocks, t_MH: Array, base: str) -> tuple[Array, Array, Array]:

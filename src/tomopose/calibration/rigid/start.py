@@ -27,7 +27,7 @@ MOVED_SOURCE = 1e-3
 @dataclass(frozen=True, kw_only=True)
 class Rays:
     """n (k, 2, 3), d (k, 2): n . x_T + d = 0 for every pixel, divided by the depth so that they count pixels;
-    source (3,): where the source stands in T in the first pose, mm."""
+    source (3,): where the source is in T in the first pose, mm."""
 
     n: Array
     d: Array
@@ -83,8 +83,8 @@ def resection(problem: Problem, t: Array, rays: Rays) -> Array:
     """R_HT (3, 3) from the linear resection with the balls taken at t (balls, 3).
 
     Written from one source position s, n . (A y + c) + l (n . s + d) = 0 with c = t_HT - l s is homogeneous in
-    (A, c, l); l drops out where the source keeps its place in T, that is, while the table stands still.  A is a
-    rotation but for its scale and sign, which det A > 0 settles: the mirrored solution is never taken.
+    (A, c, l); l drops out where the source keeps its place in T, that is, while the table does not move.  A is a
+    rotation except for its scale and sign, which det A > 0 settles: the mirrored solution is never taken.
     """
     n = rays.n
     y = (problem.R_MH @ t[problem.ball][:, :, None])[..., 0] + problem.t_MH
@@ -117,7 +117,7 @@ def closed_form(problem: Problem, rays: Rays) -> tuple[Array, Array, Array]:
 
 def turned_about_beam(problem: Problem, R_HT: Array, rays: Rays) -> tuple[Array, Array, Array]:
     """The start half a turn about the beam from R_HT: what the closed form of nearly flat data may land on behind the
-    source, since only the weak change of magnification tells the two apart."""
+    source, since only the weak change of magnification distinguishes the two."""
     beam = rays.source / np.linalg.norm(rays.source)
     turned = (2 * np.outer(beam, beam) - np.eye(3)) @ R_HT
     return (turned, *positions_for(problem, turned, rays))

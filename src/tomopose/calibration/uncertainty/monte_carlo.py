@@ -82,7 +82,7 @@ def draw(
         x = at.x_D + np.einsum("kij,bkj->bki", root, rng.standard_normal((b, n, 2)))
         R, t = problem.R_MH[None], problem.t_MH[None]
         if noise is not None:
-            # the log holds the pose before its scatter: the plate stood elsewhere than it says
+            # the log holds the pose before its scatter: the plate was elsewhere than it says
             R = problem.R_MH @ exp_rotation(noise.rotation * rng.standard_normal((b, n, 3)))
             t = problem.t_MH + noise.translation * rng.standard_normal((b, n, 3))
         prior = sigma * rng.standard_normal((b, f)) + truth.delta if f else np.zeros((1, 0))

@@ -136,7 +136,7 @@ def scatter_variance(calibration: Calibration, poses: PoseSequence, x_M: Any) ->
     """(n, m, 2) px^2: what the plate's scatter from pose to pose adds to points x_M (m, 3) of the object, and that of
     scanner parameters from view to view.
 
-    poses: where the plate stands (corrected).
+    poses: the plate's real poses (corrected).
     """
     scatter, T_MH = calibration.errors.scatter, poses.T_MH
     variance = np.zeros(6) if scatter is None else scatter.variance

@@ -70,7 +70,7 @@ def _with_robust_background(fit: RimFit) -> RimFit:
 
 
 def _good_without_worst_lines(fit: RimFit) -> npt.NDArray[np.bool_] | None:
-    """The window's good pixels without the worst dead lines; None where there are none."""
+    """The window's good pixels without the worst dead lines; None where no good pixel is left."""
     settings, window = fit.settings.fit, fit.window
     away = away_from_rim(fit)
     size = np.abs(fit.residual)

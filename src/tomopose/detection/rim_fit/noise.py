@@ -39,7 +39,7 @@ def excess_variance(square, freedom, rare):  # type: ignore[no-untyped-def]
 def _weights(s, residual, model, first, stand, parameters, outlier, clipped, kept_below):  # type: ignore[no-untyped-def]
     """(weight (n,), variance inside, outside, excess (k,), spread): weights by a variance linear in the level.
 
-    s: signed distance; first: (k + 1,), where sectors begin; stand: blur, background level, ball's value, and least
+    s: signed distance; first: (k + 1,), where sectors begin; state: blur, background level, ball's value, and least
     variance; parameters: linear parameters that a sector's pixels determine.  Pixels more than `outlier` standard
     deviations off get no weight.  The variance outside is that of the sectors that are fitted well, NaN where none has
     enough pixels; excess: each sector's chi-square outside less 1; spread: what noise alone lets it vary by.

@@ -68,7 +68,7 @@ def with_priors(fit: RimFit, of: Equations, unknowns: Unknowns) -> tuple[Array, 
 
 
 def place_of(unknowns: Unknowns, nodes: int, index: Indices) -> Indices:
-    """Where the parameters with those indices stand among those that are fitted."""
+    """Where the parameters with those indices are among those that are fitted."""
     return np.searchsorted(active_parameters(unknowns, nodes), index)
 
 
@@ -127,7 +127,7 @@ def _assembled(blocks, share):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _place(p, node, k):  # type: ignore[no-untyped-def]
-    """Where parameter p of a sector's Jacobian stands among all parameters."""
+    """Where parameter p of a sector's Jacobian is among all parameters."""
     if p < FIRST_NODE:
         return p
     if p < FIRST_NODE + 3:

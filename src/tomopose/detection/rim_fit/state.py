@@ -123,8 +123,9 @@ class RimFit:
     """The state between two stages.
 
     window, ring, pixels: what is fitted; expected: the nominal radius, px.  distance (n,): of each pixel from the rim.
-    parameters, model (n,), jacobian (14, n): where the fit stands.  weight (n,): 1 / variance, 0 for a pixel that is
-    left out; shells: how many have any.  unknowns, careful: what is fitted, and whether each step must lower the cost.
+    parameters, model (n,), jacobian (14, n): the present state of the fit.  weight (n,): 1 / variance, 0 for a pixel
+    that is left out; shells: how many have any.  unknowns, careful: what is fitted, and whether each step must lower
+    the cost.
     floor: least variance of a pixel; spread: standard deviation of the ring's values.  noise, doubt (2, 2), anisotropy:
     what the later stages find; doubt is to be added to the centre's covariance.
     """

@@ -24,7 +24,7 @@ INWARDS, DEEPEST = 0.12, 10.0
 def is_transparent(fit: RimFit) -> bool:
     """Whether the ball grows darker towards its middle by more than noise and 1 % of its contrast.
 
-    True as well where the blur is so wide that little of the middle is left to tell by.
+    True as well where the blur is so wide that little of the middle is left to decide by.
     """
     p, settings = fit.parameters, fit.settings.fit
     depth, radius = 3 * p.blur + 0.5, p.radius

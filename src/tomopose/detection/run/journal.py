@@ -1,4 +1,4 @@
-"""An append-only journal of finished images, so that an interrupted run goes on where it stopped.
+"""An append-only journal of finished images, so that an interrupted run continues where it stopped.
 
 The first line holds the run's key: scanner, diameter, mask, settings and the versions that calculate.  Each further
 line is one image, with the digest of all its pixels (corrected by flat and dark field, where there are any) and of the

@@ -22,7 +22,7 @@ def document(cal: Calibration) -> dict[str, Any]:
     unseen = cal.unseen
     stated = [{"name": a.name, "sigma": encode(a.sigma), "unit": a.unit, "from": a.source} for a in cal.assumed]
     if unseen is not None:
-        # one list for the reader; the gains that belong to these stand under "unseen"
+        # one list for the reader; the gains that belong to these are under "unseen"
         stated += [
             {"name": name, "sigma": encode(float(s)), "unit": unseen_unit(name), "from": "default"}
             for name, s in zip(unseen.names, unseen.sigma, strict=True)

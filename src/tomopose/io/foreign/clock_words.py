@@ -23,7 +23,7 @@ HALF_DAY = DAY / 2
 def seconds_of(words: Sequence[str]) -> tuple[Array, str] | None:
     """The stamps as seconds (n,) and their clock in words; None where one of them is no time.
 
-    Times of day that pass midnight go on counting.
+    Times of day that pass midnight keep counting.
     """
     for read in (_dates, _times_of_day, _counts):
         found = read(words)

@@ -42,7 +42,7 @@ which.
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table: where it stands, its name without unit, its unit ("" where none is stated), set or
+    """A column of a table: its place, its name without unit, its unit ("" where none is stated), set or
     measured.
     """
 

@@ -36,7 +36,7 @@ class IniText:
         return None
 
     def number(self, key: str, *sections: str) -> float | None:
-        """The value as a number; InputError where it is there and is none."""
+        """The value as a number; InputError where it is there and is not a number."""
         word = self.word(key, *sections)
         if word is None:
             return None

@@ -1,7 +1,7 @@
 """Homogeneous matrices 4 x 4 (tool or plate in its base): text in blocks or one matrix a row, .npy, .npz, .json.
 
-The last row 0 0 0 1 tells rows from columns; lists that store columns first (as Franka's O_T_EE) have the translation
-in their last row and are recognised by it.  The unit of the translation is never guessed.
+The last row 0 0 0 1 distinguishes rows from columns; lists that store columns first (as Franka's O_T_EE) have the
+translation in their last row and are recognised by it.  The unit of the translation is never guessed.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def _is_homogeneous(T: Array) -> bool:
 
 
 def _json_matrices(file: ForeignFile) -> Array | None:
-    """(n, 4, 4) of a JSON list, or of the one list of matrices in a JSON object; None where there is none."""
+    """(n, 4, 4) of a JSON list, or of the one list of matrices in a JSON object; None otherwise."""
     try:
         content: Any = parse_json(file.text, file.path)
     except TomoposeError:

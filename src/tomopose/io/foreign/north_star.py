@@ -44,7 +44,7 @@ def read(file: ForeignFile) -> ScannerDraft:
     changed = [k for k in ("source to detector distance", "source to table distance") if len(set(said.get(k, ()))) > 1]
     turned = said.get("rotation description", [""])[-1]
     readings = ["`source to table distance` is taken as the distance to the rotation axis"]
-    readings += [f"{k} stands more than once with different values; the last is taken" for k in changed]
+    readings += [f"{k} appears more than once with different values; the last is taken" for k in changed]
     if re.search(r"[1-9]", turned):
         readings.append(f"the detector's images are turned ({turned}); width and height may be exchanged")
     return ScannerDraft(

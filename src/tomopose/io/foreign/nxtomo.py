@@ -78,7 +78,7 @@ def _projections(entry: Any, n: int) -> Any:
 
 
 def read_poses(file: ForeignFile, options: PoseOptions) -> PoseLog:
-    """Table angle and x, y, z translation of each projection; the plate's rotation is none."""
+    """Table angle and x, y, z translation of each projection; the plate does not rotate."""
     with _open(file) as nexus:
         entry = _only(nexus, file)
         n = entry[DATA].shape[0]

@@ -6,14 +6,14 @@ A log of replies is read by this grammar; blank lines and lines that begin with 
     line   = [time stamp] [">>" | "<<" | "TX:"]  what a terminal writes before each line
     query  = [">"] NAME "?" [arguments]          POS? MOV? SPI? KEN? KLN? KLS? *IDN? and others, one a line
     reply  = { line }                            up to the next query or command
-    POS?   : X= Y= Z= U= V= W=                   where the encoders say that the plate stands; one or several on a line
-    MOV?   : X= Y= Z= U= V= W=                   where it was told to go
+    POS?   : X= Y= Z= U= V= W=                   where the encoders say that the plate is; one or several on a line
+    MOV?   : X= Y= Z= U= V= W=                   the commanded pose
     SPI?   : R= S= T=  or  X= Y= Z=              the pivot point, mm
 
 One POS? reply, one MOV? reply, or one of each, in either order, is a pose; a second reply of the same kind begins the
 next.  Axes A and B, which are no axes of the plate, are passed over.  Other queries are kept as text: if the reply to
 SPI?, KEN?, KLN?, KLS? or *IDN? changes, or a command that changes the coordinate system, the pivot or the reference
-stands between the poses (SPI, KEN, KSD, KSF, KST, KSW, KLN, KLD, FRF), the log is refused, since its poses then
+is between the poses (SPI, KEN, KSD, KSF, KST, KSW, KLN, KLD, FRF), the log is refused, since its poses then
 belong to two systems.
 
 A list of MOV commands without any reply gives the set poses; remarks `; pose_id NAME` and `; table to X deg` name them.

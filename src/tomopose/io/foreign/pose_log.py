@@ -161,7 +161,7 @@ def visiting_order(declared: Sequence[str], visited: Sequence[str]) -> tuple[lis
     left = [name for name in declared if name not in known]
     notes: tuple[str, ...] = (f"points that no move visits are left out: {some(left)}",) if left else ()
     if known != [name for name in declared if name in known]:
-        notes += ("the poses stand in the order of the moves, not of the declarations",)
+        notes += ("the poses are in the order of the moves, not of the declarations",)
     return known, notes
 
 
@@ -171,6 +171,6 @@ def one_value(found: Sequence[str], what: str, path: Path) -> str:
     if len(values) > 1:
         raise InputError(
             f"{path}: {what} changes from {values[0]} to {values[1]} between the poses; poses of several frames "
-            "cannot stand in one table: split the file, or record all poses in one frame"
+            "cannot be in one table: split the file, or record all poses in one frame"
         )
     return values[0] if values else ""

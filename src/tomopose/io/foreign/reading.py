@@ -45,7 +45,7 @@ def read_pose_log(
 
     Raises
     ------
-    FileError where the file is of another kind (the message says which, and the way on), InputError, UnitError and
+    FileError where the file is of another kind (the message says which, and how to proceed), InputError, UnitError and
     ConventionError by line for everything else.
     """
     file = ForeignFile(Path(path))
@@ -63,7 +63,7 @@ def read_scanner_draft(path: str | Path) -> ScannerDraft:
     """The scanner that a maker's file states: Nikon, phoenix, SkyScan, Zeiss, RX Solutions, North Star, Yxlon, Diondo,
     NXtomo, DICOM, CTSimU, robot-CT JSON, or `name = value` lines.
 
-    Raises FileError where the file is of another kind (the message says which, and the way on), InputError where a
+    Raises FileError where the file is of another kind (the message says which, and how to proceed), InputError where a
     value cannot be used.
     """
     file = ForeignFile(Path(path))

@@ -1,4 +1,4 @@
-"""All kinds of foreign files that are known, most telling first, and the one that a file is."""
+"""All kinds of foreign files that are known, most specific first, and the one that a file is."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ ALIASES = {
     "pi": ("pi-gcs", "pi-recorder", "pi-python"),
     "table": ("csv",),
 }
-"""Words of --format that stand for one kind or several."""
+"""Words of --format that denote one kind or several."""
 
 
 def kind_of(file: ForeignFile) -> Kind | None:
@@ -84,7 +84,7 @@ def kind_of(file: ForeignFile) -> Kind | None:
 def pose_kind(file: ForeignFile, format: str | None) -> Kind:
     """The kind whose reader gives a file's poses.
 
-    Raises ConventionError for an unknown format, FileError, with the way on, where the file is of another kind.
+    Raises ConventionError for an unknown format, FileError, with how to proceed, where the file is of another kind.
     """
     readers = {k.name: k for k in KINDS if k.read_poses is not None}
     if format is not None:
@@ -103,7 +103,7 @@ def pose_kind(file: ForeignFile, format: str | None) -> Kind:
 
 
 def scanner_kind(file: ForeignFile) -> Kind:
-    """The kind whose reader gives a file's scanner; FileError, with the way on, where it is of another kind."""
+    """The kind whose reader gives a file's scanner; FileError, with how to proceed, where it is of another kind."""
     kind = kind_of(file)
     if kind is None or kind.read_scanner is None:
         raise FileError(f"{file.path}: {_what_it_is(file, 'scanner')}", path=file.path)
@@ -111,7 +111,7 @@ def scanner_kind(file: ForeignFile) -> Kind:
 
 
 def describe(path: str | Path, wanted: str) -> str:
-    """What a file likely is and how to go on, for whoever wanted `poses`, `scanner`, `geometry` or `images` of it."""
+    """What a file likely is and how to proceed, for whoever wanted `poses`, `scanner`, `geometry` or `images` of it."""
     return _what_it_is(ForeignFile(Path(path)), wanted)
 
 

@@ -1,7 +1,7 @@
 """Bruker SkyScan: .log.  Distances in mm, pixel sizes in micrometres.
 
 Source: the sections [System] and [Acquisition] as the scanners write them; the image pixel size is the camera's,
-divided by the magnification, which tells whether the stated camera pixel is that of the binned image.
+divided by the magnification, which shows whether the stated camera pixel is that of the binned image.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ def _chosen(
     else:
         rows = alone
     if not rows:
-        raise InputError(f"{file.path}: no move goes to a pose p[x, y, z, rx, ry, rz], and no pose stands alone")
+        raise InputError(f"{file.path}: no move goes to a pose p[x, y, z, rx, ry, rz], and no pose is given on its own")
     return PoseLog(
         path=file.path,
         convention="ur",

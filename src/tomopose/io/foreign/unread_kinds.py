@@ -1,4 +1,4 @@
-"""Kinds of files that are not read: recognised by their mark or their ending, and answered with the way on."""
+"""Kinds of files that are not read: recognised by their mark or their ending, and answered with how to proceed."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ENDINGS: Mapping[str, tuple[str, str]] = {
     ".stp": ("a STEP model", "models go to `plan scan --part`, as STL"),
     ".step": ("a STEP model", "models go to `plan scan --part`, as STL"),
     ".tp": ("a FANUC binary program", "save it as a listing (.ls) on the controller"),
-    ".pgx": ("a Staubli program", "the points stand in the .dtx beside it: import that"),
+    ".pgx": ("a Staubli program", "the points are in the .dtx beside it: import that"),
     ".jpg": ("a JPEG picture", "export the detector's 16-bit data as TIFF"),
 }
 NEXT: Mapping[str, str] = {
@@ -62,7 +62,7 @@ NEXT: Mapping[str, str] = {
 
 
 def likely_kind(file: ForeignFile, wanted: str) -> str:
-    """What a file of no known kind likely is, and how to go on."""
+    """What a file of no known kind likely is, and how to proceed."""
     if not file.head:
         return "the file is empty (0 bytes); copy it again"
     for mark, what, way in MARKS:

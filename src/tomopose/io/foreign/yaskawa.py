@@ -1,6 +1,6 @@
 """Yaskawa Motoman: INFORM jobs (.jbi).  X Y Z in mm, Rx Ry Rz in deg about fixed axes: R = R_z R_y R_x.
 
-Positions that a job keeps as encoder pulses say nothing without the robot's gears and are refused with the way on.
+Positions that a job keeps as encoder pulses say nothing without the robot's gears and are refused with how to proceed.
 Source: Yaskawa, INFORM language manual (//POS, ///POSTYPE, ///RECTAN, ///PULSE, C00000=...).
 """
 

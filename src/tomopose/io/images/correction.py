@@ -29,7 +29,7 @@ class FlatField:
 
 
 def correction(dark: Image | None, flat: Image | None, bad_pixels: Image | None, shape: tuple[int, int]) -> FlatField:
-    """The correction with mean dark and flat images [v, u] (dark 0 and flat 1 where there are none).
+    """The correction with mean dark and flat images [v, u] (dark 0 and flat 1 where they are absent).
 
     Pixels where F - D <= 0 or is not finite are bad; so are those of `bad_pixels`.  InputError where a shape does not
     fit or more than half of the pixels would be bad.

@@ -1,4 +1,4 @@
-"""DICOM: portal and radiographic images, one or more frames a file, as their pixel values stand."""
+"""DICOM: portal and radiographic images, one or more frames a file, as their pixel values are."""
 
 from __future__ import annotations
 

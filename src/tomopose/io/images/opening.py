@@ -70,7 +70,7 @@ def open_images(
     Parameters
     ----------
     source:      a folder, a file, a glob pattern, or a list of files.  Folders and patterns are taken in natural order
-                 (pose_2 before pose_10), lists as they stand.  TIFF (single, multi-page, ImageJ), HDF5 and NXtomo,
+                 (pose_2 before pose_10), lists as they are.  TIFF (single, multi-page, ImageJ), HDF5 and NXtomo,
                  DICOM; RAW with `raw_layout`.
     scanner:     checks the image size and gives the row order, if `rows` does not.
     dark, flat:  images[v, u], or files of them, which are averaged; with them images are transmission
@@ -133,7 +133,7 @@ def open_images(
 
 
 def find_files(source: Source) -> list[Path]:
-    """The image files that a folder, file, pattern or list means.  FileError where there are none."""
+    """The image files that a folder, file, pattern or list means.  FileError where there are no images."""
     if not isinstance(source, (str, os.PathLike)):
         paths = [Path(p) for p in source]
         if not paths:
@@ -235,7 +235,7 @@ def _rows(frames: FrameSource, rows: Rows | None, scanner: Scanner | None) -> Ro
 def _require_same_rows(frames: UprightSource, rows: Rows | None) -> None:
     """ConventionError where the caller says bottom-first and the file's Orientation says that row 0 is the top.
 
-    The default of a scanner is top-first: it cannot be told from a word of the user and contradicts nothing.
+    The default of a scanner is top-first: it cannot be distinguished from a word of the user and contradicts nothing.
     """
     row_0 = TURNS[frames.orientation].row_0
     if rows == "bottom-first" and row_0 != "bottom":

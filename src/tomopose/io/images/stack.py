@@ -29,7 +29,7 @@ HEAD_BYTES = 1 << 16
 
 
 def partial(path: Path) -> Path:
-    """The name that a stack bears until it is whole."""
+    """The name of a stack until it is complete."""
     return path.with_name(path.name + ".partial")
 
 

@@ -39,7 +39,7 @@ def write_hdf5(
     rows: Rows = "top-first",
     force: bool = False,
 ) -> int:
-    """Images [v, u], one after the other, as a stack [frame, row, column]; the row order stands beside it.
+    """Images [v, u], one after the other, as a stack [frame, row, column]; the row order is written beside it.
 
     Returns the number of images.  Nothing but one image is held in memory.
     """

@@ -13,7 +13,7 @@ L H out of C, so that with K, the sum of H over the same pairs,
 Interpolation between voxels makes neighbours further off differ (rho < 0), which belongs to the sum too: the window is
 never shorter than a share of the range, and grows until it holds several times the points that act as one.
 
-Points with weights w of mean 1, as for the areas that they stand for, count by them: s^2 L = 1/n sum w_i w_j C_ij, with
+Points with weights w of mean 1, as for the areas that they represent, count by them: s^2 L = 1/n sum w_i w_j C_ij, with
 w_i w_j in the sums of r_i r_j, w_i in that of r_i^2, and H of the weighted fit.
 """
 
@@ -77,12 +77,12 @@ def independence(
     wide = np.arange(len(count)) + 1 >= SHORTEST * len(count)
     enough = usable[wide[usable] & (count[usable] >= HOLDS * acting[usable])]
     window = int(enough[0]) if enough.size else int(usable[-1])
-    # A point never stands for less than itself.
+    # A point never represents less than itself.
     L = float(np.clip(acting[window], least, n)) if np.isfinite(acting[window]) else least
     freedom = k * n - L * p
     if freedom <= 0:
         return Independence(variance=np.inf, n_effective=n / L, dof=0.0)
-    # Each window full of points tells L once.
+    # Each window full of points gives L once.
     dof = max(min(k * n / float(count[window]), k * n - p), 1.0)
     return Independence(variance=L * total / freedom, n_effective=n / L, dof=dof)
 

@@ -7,7 +7,7 @@ A circle in space is the two-step one: plane first, then the circle in it.
 All functions take points (n, 3), mm in any one frame, and share these options:
 
 sigma:              (n,) standard uncertainties of the points, mm; equal unless given.
-area:               (n,) of the surface that each point stands for; equal unless given.  Vertices of a mesh crowd where
+area:               (n,) of the surface that each point represents; equal unless given.  Vertices of a mesh crowd where
                     it passes close to a voxel's centre; weighed by areas, each piece of the surface counts alike.
 outliers:           points farther than so many rms from the fit are dropped and the fit is repeated; None keeps all.
 correlation_range:  distance up to which neighbouring points are tested for common errors, mm; 0 takes every point as

@@ -42,7 +42,7 @@ class Identified:
 def find_spheres(surface: Surface, radius: float) -> Array:
     """Centres (m, 3), mm in W, of balls of about `radius`, mm, in a surface; brightest vote first.
 
-    InputError where there is none: a wrong radius or a wrong unit.
+    InputError where it is not found: a wrong radius or a wrong unit.
     """
     from scipy.ndimage import label, maximum_filter, uniform_filter
 

@@ -31,7 +31,7 @@ def build_tree(low: Array, high: Array, middle: Array) -> Any:
     most = 4 * (m // LEAF + 1) + 1
     box, span = np.empty((most, 6)), np.empty((most, 2), dtype=np.int64)
     second = np.full(most, -1, dtype=np.int64)
-    # (first, last + 1, parent to be told where its second child is, or -1)
+    # (first, last + 1, parent that must know where its second child is, or -1)
     stack = [(0, m, -1)]
     n = 0
     while len(stack) > 0:

@@ -79,7 +79,7 @@ def _plateaus(g: Array) -> Any:
 
 @njit(cache=True)
 def _crossing(g: Array, level: float, window: float) -> Any:
-    """Falling crossing of `level` nearest to the middle, s relative to it; nan where there is none."""
+    """Falling crossing of `level` nearest to the middle, s relative to it; nan where there is no crossing."""
     best = np.nan
     for k in range(g.shape[0] - 1):
         if g[k] >= level > g[k + 1]:

@@ -45,7 +45,7 @@ SIGMA_RANGE = (0.3, 4.0)
 START_SIGMA = 1.0
 LONGER, LEVEL, LEAST_LONGER = 4.0, 3e-3, 100
 """By how many voxels plateaus may be longer, the share of the contrast by which that may change the levels of the whole
-surface, and the number of edges from which that can be told."""
+surface, and the number of edges from which that can be decided."""
 FLAT_SHARE, FLAT_NOISE = 0.1, 3.0
 """A plateau counts as missing where its halves differ by more than this share of the contrast plus so many rms."""
 
@@ -249,7 +249,7 @@ def _estimated_sigma(volume: Volume, index: Array, step: Array, settings: EdgeSe
 
 
 def _lengthen(result: Array, flags: np.ndarray) -> int:
-    """Longer plateaus, which tell grey levels better, where nothing speaks against them: into the rows of results.
+    """Longer plateaus, which determine grey levels better, where nothing speaks against them: into the rows of results.
 
     The levels beyond the window join the least squares of each fit that has them.  None do where that would change
     levels over the whole surface (cupping): the median change, and twice what it is uncertain by, must stay below LEVEL

@@ -20,7 +20,7 @@ SMOOTHING = 0.01
 """Width of the Gaussian over the histogram, as a share of its range: wider than binning noise, narrower than modes."""
 INVERTED_SHARE = 0.6
 PROMINENT = 0.2
-"""Share of its own height by which a mode must stand out."""
+"""Share of its own height by which a mode must exceed its surroundings."""
 
 
 @dataclass(frozen=True, kw_only=True)

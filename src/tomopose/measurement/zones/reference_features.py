@@ -9,7 +9,7 @@ in ISO 5459.  All points count, and a few of them, the contacts, determine the f
     maximum-inscribed       the largest one, near the least-squares one, that holds none
 
 Only points at the rim of the cloud can be contacts.  A few hundred of them are solved for exactly, all points are held
-against the solution, those beyond it join, and so on until there are none: then the solution is that of all points.
+against the solution, those beyond it join, and so on until no more join: then the solution is that of all points.
 """
 
 from __future__ import annotations

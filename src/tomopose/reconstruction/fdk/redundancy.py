@@ -106,7 +106,7 @@ class Redundancy:
         return (added, 0) if (self.fan.high > self.fan.low) == self.fan.first_low else (0, added)
 
     def _by_source(self, beta: Array) -> Array:
-        """c: where the source stands."""
+        """c: where the source is."""
         if self.path.full_turn:
             return np.ones_like(beta)
         start = float(self.path.holes[0].sum())

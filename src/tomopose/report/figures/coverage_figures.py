@@ -1,4 +1,5 @@
-"""What the poses cover, and what they can tell: detector, rotations, table angles, correlations, singular values."""
+"""What the poses cover, and what they can determine: detector, rotations, table angles, correlations, singular
+values."""
 
 from __future__ import annotations
 
@@ -133,8 +134,8 @@ def rotation_map(joined: Joined) -> Figure | None:
     return Figure(
         title="Coverage of rotations",
         meaning="The rotation vector of each pose, seen along three axes.",
-        look_for="Points on the axes only are single rotations: they cannot tell one order of the angles from another; "
-        "points off the axes can.",
+        look_for="Points on the axes only are single rotations: they cannot distinguish one order of the angles "
+        "from another; points off the axes can.",
         data=data,
         layout=layout(**extra),
         height=320,
@@ -225,9 +226,10 @@ def singular_values(calibration: Calibration) -> Figure:
     s = np.asarray(calibration.observability.singular_values, dtype=np.float64)
     words = (
         "below 100 is healthy, and a last bar that falls off by orders of magnitude is a direction the poses cannot "
-        "tell."
+        "determine."
         if calibration.model == "rigid"
-        else "a long tail is normal where a manipulator's errors are estimated: priors hold what the poses cannot tell."
+        else "a long tail is normal where a manipulator's errors are estimated: priors hold what the poses "
+        "cannot determine."
     )
     wide_range = s.size > 0 and s.min() > 0 and s.max() / s.min() > 200
     return Figure(

@@ -71,7 +71,7 @@ def error_bars(
 
 
 def group_bars(words: str, rows: Sequence[MeasurementResult], results: MeasurementResults) -> Figure:
-    """Mean errors of the groups of repeats and of the volumes that stand alone, side by side (figs. 13 to 16)."""
+    """Mean errors of the groups of repeats and of the volumes that are single, side by side (figs. 13 to 16)."""
     names = list(dict.fromkeys(r.name for r in rows))
     data: list[dict[str, Any]] = []
     bars: dict[str, dict[str, tuple[float, float]]] = {}

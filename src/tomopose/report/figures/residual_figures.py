@@ -130,7 +130,7 @@ def by_pose(joined: Joined) -> Figure:
         title="Reprojection error by pose (paper, fig. 8)",
         meaning="d_k of eq. (8): the distance between detected and calculated ball centre for each pose, coloured by "
         "the axis of the manipulator's rotation.",
-        look_for="One colour that stands above the others is a rotation which the manipulator does not perform as it "
+        look_for="One colour far above the others is a rotation which the manipulator does not perform as it "
         "reports; single points far above are bad images.",
         data=data,
         layout=layout(xaxis=axis("pose number"), yaxis=axis("d / px", rangemode="tozero")),

@@ -53,7 +53,7 @@ def checks_section(calibration: Calibration) -> Section | None:
         return None
     return Section(
         title="Models and checks",
-        lead="Which model the data support, and whether everything stood still while the images were taken.",
+        lead="Which model the data support, and whether everything kept its place while the images were taken.",
         blocks=blocks,
     )
 
@@ -117,7 +117,7 @@ def _stability(found: Stability) -> list[Block]:
     if found.effects:
         blocks.append(
             Table(
-                title="Did everything stand still?",
+                title="Did everything keep its place?",
                 meaning="Drift and steps, with the probability that chance alone makes one as large.",
                 columns=["effect", "what it would be", "size / px", "probability by chance", "at pose"],
                 rows=[[e.name, e.words, cell(e.size_px), probability(e.p), e.at or "–"] for e in found.effects],

@@ -292,7 +292,7 @@ def _budgets(results: MeasurementResults) -> list[Section]:
                 Table(
                     title="Shares",
                     meaning="Fit and repeats show the same scatter, the larger counts; the calibration's share is "
-                    "added in squares. Virtual scans hold noise and systematic part, and stand for all: their mean "
+                    "added in squares. Virtual scans hold noise and systematic part, and cover all: their mean "
                     "error is taken off the value, and U is that of one more scan like them.",
                     columns=[
                         "volume",

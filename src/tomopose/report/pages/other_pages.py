@@ -1,4 +1,4 @@
-"""Reports of what stands before and after a calibration: detections alone, and the matrices of a scan."""
+"""Reports of what precedes and follows a calibration: detections alone, and the matrices of a scan."""
 
 from __future__ import annotations
 

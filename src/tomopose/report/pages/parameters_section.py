@@ -58,7 +58,7 @@ def parameters_section(calibration: Calibration) -> Section:
         )
     )
     lead = (
-        "How the scanner sits on the moved plate, and where the ball stands."
+        "How the scanner sits on the moved plate, and where the ball is."
         if calibration.inverse
         else "How the manipulator sits on the table, and where the ball is."
     )

@@ -168,7 +168,7 @@ def _decorate(ax: Any, plan: Mapping[str, Any]) -> None:
 
 
 def _draw(ax: Any, trace: Mapping[str, Any], k: int, n: int) -> None:
-    """One trace; bars stand side by side, this one the k-th of n."""
+    """One trace; bars are side by side, this one the k-th of n."""
     kind, name = trace["type"], str(trace.get("name", ""))
     marker, line = trace.get("marker", {}), trace.get("line", {})
     shown = {} if trace.get("showlegend") is False or not name else {"label": name}

@@ -65,7 +65,7 @@ def volume_report(volume: Volume, *, title: str = "Reconstruction report") -> st
                 ),
             ],
             sections=[
-                Section(title="The volume", lead="Middle slices; the object stands as at home.", blocks=blocks),
+                Section(title="The volume", lead="Middle slices; the object is as at home.", blocks=blocks),
                 Section(
                     title="Agreement of the views",
                     lead="How well the volume explains each radiograph.",

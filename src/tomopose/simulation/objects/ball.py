@@ -27,7 +27,7 @@ def ball_in_holder(
     """Ball of WC-Co at t (3,) mm in M, its lower half in a PEEK tube whose rim lies at the ball's equator.
 
     axis: the tube's direction in M, towards the ball; lengths and diameters in mm.  The tube's bore has the ball's
-    diameter; below the tube an aluminium extension goes on.
+    diameter; below the tube an aluminium extension continues.
     """
     r = ball_diameter / 2
     outer = (1.5 * ball_diameter if tube_diameter is None else tube_diameter) / 2

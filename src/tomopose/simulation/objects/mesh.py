@@ -181,7 +181,7 @@ class Tracer:
             slope = np.einsum("ij,ij->i", self.normal[face], d[live])
             with np.errstate(divide="ignore", invalid="ignore"):
                 t = (self.offset[face] - np.einsum("ij,ij->i", self.normal[face], o[live])) / slope
-            # A ray within the triangle's plane has no crossing of its own: float32's place stands.
+            # A ray within the triangle's plane has no crossing of its own: float32's place is kept.
             t = np.where(
                 np.isfinite(t) & (np.abs(t - begin[live] - reach) < 0.01 + 1e-3 * np.abs(reach)), t, begin[live] + reach
             )

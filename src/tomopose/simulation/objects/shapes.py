@@ -59,7 +59,7 @@ class Shape:
         raise NotImplementedError
 
     def bound(self) -> tuple[Array, float]:
-        """(centre, radius), mm, of a sphere that holds the shape; the radius is inf where there is none."""
+        """(centre, radius), mm, of a sphere that holds the shape; the radius is inf where there is no limit."""
         raise NotImplementedError
 
     def corners(self) -> Array:

@@ -22,7 +22,8 @@ BASE_RADIUS, BASE_HEIGHT = 48.0, 8.0
 
 
 def standard_layout() -> Array:
-    """(27, 3), mm, in the standard's own frame: z up, the origin amid the spheres.  Source of data/standard.csv."""
+    """(27, 3), mm, in the standard's own frame: z up, the origin in the middle of the spheres.  Source of
+    data/standard.csv."""
     k = np.arange(27)
     angle = k * np.pi * (3 - np.sqrt(5))
     radius = 40.0 * np.sqrt((k + 0.5) / 27)

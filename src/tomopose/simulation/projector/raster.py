@@ -119,7 +119,8 @@ def _sides(edges: Arrays, j: int) -> Any:
 
 @njit(cache=True, nogil=True, inline="always")
 def _reach_in_row(edges: Arrays, j: int) -> Any:
-    """(least, largest) x of a triangle's edges between the lines y = j and j + 1; (inf, -inf) where there are none."""
+    """(least, largest) x of a triangle's edges between the lines y = j and j + 1; (inf, -inf) where there are no such
+    values."""
     left, right = np.inf, -np.inf
     for e in edges:
         # The ends of a level edge belong to the other two.

@@ -82,7 +82,7 @@ def shadow(
     margin: int,
 ) -> Window | None:
     """The pixels that convex hulls of points (k, 3) in their frames can shade, with a margin, cut `margin` outside
-    the detector; None where there are none."""
+    the detector; None where no ball is seen."""
     boxes = shadow_boxes(outlines, view, T_FW)
     lo, hi = np.floor(boxes[:, 0].min(axis=0)) - margin, np.ceil(boxes[:, 1].max(axis=0)) + margin
     size = np.array([scanner.n_u, scanner.n_v])

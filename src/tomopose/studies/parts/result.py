@@ -81,7 +81,7 @@ class StudyResult:
         return all(c.holds for c in self.checks)
 
     def row(self, group: str, quantity: str) -> StudyRow:
-        """The row of that group and quantity; InputError where there is none."""
+        """The row of that group and quantity; InputError where it is not found."""
         for row in self.rows:
             if (row.group, row.quantity) == (group, quantity):
                 return row

@@ -30,7 +30,7 @@ AGAINST_CIRCLE = (
      "sphericity, mean of 27", 1.0),
     ("the 3D scan's distances are not worse than the circular scan's (fig. 14, rms)", "Fig. 14",
      "errors of 351 distances, rms", 1.0),
-    ("the 3D scan's diameters scatter no more than the circular scan's, but for chance (fig. 15)", "Fig. 15",
+    ("the 3D scan's diameters scatter no more than the circular scan's, except for chance (fig. 15)", "Fig. 15",
      "scatter of 27 diameters", CHANCE),
 )  # fmt: skip
 """(statement, figure, quantity, largest ratio to the better circular volume's)."""

@@ -145,7 +145,8 @@ def true_lengths(edge: float) -> Mapping[str, float]:
 
 
 def measure_specimen(volume: Volume, edge: float) -> dict[str, Any]:
-    """Deviation (um) at each vertex of the reference, None where there is none; errors of the lengths (um); a slice."""
+    """Deviation (um) at each vertex of the reference (None without one); errors of the lengths (um); a
+    slice."""
     mesh = reference(edge)
     start = Alignment(R=MOUNTED, t=np.zeros(3), rule="given")
     search = max(SEARCH_MM, SEARCH_VOXELS * float(volume.grid.spacing[0]))

@@ -87,7 +87,7 @@ def volume_for(
     checkpoint: FilePath | None,
     progress: Progress | None,
 ) -> Volume:
-    """Reconstructed by an algorithm; a kept state lets an interrupted one go on.
+    """Reconstructed by an algorithm; a kept state lets an interrupted one continue.
 
     FDK finds each voxel by itself, so that those far from the object need not be found.
     """
