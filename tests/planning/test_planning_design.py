@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tomopose import Scanner
 from tomopose.calibration.solve import calibrate
 from tomopose.errors import InputError, NotObservableError, OutOfReachError
+from tomopose.calibration.rigid.pose_noise import expected_scatter
 from tomopose.geometry.projection import project_ball
+from tomopose.manipulator.real_poses import Repeatability
 from tomopose.observations import BallObservations
 from tomopose.planning.design import SIGMA_PX, DesignSettings, nominal_mount, plan_poses, predicted_covariance
 from tomopose.planning.limits import PlanLimits, allowed, candidates
@@ -18,18 +22,27 @@ from tomopose.trajectory.feasibility import TravelLimits, travel
 from tomopose.trajectory.pose_grid import pose_grid
 
 BALL = np.array([8.0, -6.0, 17.0])
-ALONE = DesignSettings(resolve=False)
+STILL = Repeatability(t_mm=0.0, w_rad=0.0)
+"""Poses that are reached exactly, as the paper takes them."""
+ALONE = DesignSettings(resolve=False, maker=STILL)
 TURNED = PlanLimits(table_angles=(0.0, np.pi / 2))
 
 
 @pytest.fixture(scope="module")
 def paper_scanner():
-    return Scanner(d_SD=1500.0, d_SR=283.5, p_u=0.2, p_v=0.2, u_0=1021.37, v_0=1026.81, n_u=2048, n_v=2048)
+    """Its values are exact, as in the paper."""
+    return Scanner(d_SD=1500.0, d_SR=283.5, p_u=0.2, p_v=0.2, u_0=1021.37, v_0=1026.81, n_u=2048, n_v=2048).exact()
+
+
+@pytest.fixture(scope="module")
+def silent_scanner(paper_scanner):
+    """The same values, of which nobody says how well they are known."""
+    return replace(paper_scanner, sigma={})
 
 
 @pytest.fixture(scope="module")
 def turned_plan(paper_scanner):
-    return plan_poses(paper_scanner, t=BALL, limits=TURNED)
+    return plan_poses(paper_scanner, t=BALL, limits=TURNED, settings=DesignSettings(maker=STILL))
 
 
 def test_thirty_images_with_two_table_angles_match_the_paper_grid(turned_plan):
@@ -47,7 +60,7 @@ def test_all_but_the_true_symmetries_are_resolved(turned_plan):
 
 
 def test_the_still_table_needs_at_most_72_and_says_what_stays_hidden(paper_scanner):
-    plan = plan_poses(paper_scanner, t=BALL, n=72)
+    plan = plan_poses(paper_scanner, t=BALL, n=72, settings=DesignSettings(maker=STILL))
     assert plan.predicted <= plan.reference
     assert {h.name for h in plan.resolved.unresolved} == {
         "half a pixel low",
@@ -60,7 +73,7 @@ def test_the_still_table_needs_at_most_72_and_says_what_stays_hidden(paper_scann
 
 def test_few_images_are_chosen_so_that_alternatives_show(paper_scanner):
     """Eight images chosen for the scan alone would let half a pixel pass; the plan takes poses that show it."""
-    plan = plan_poses(paper_scanner, t=BALL, n=8, limits=TURNED)
+    plan = plan_poses(paper_scanner, t=BALL, n=8, limits=TURNED, settings=DesignSettings(maker=STILL))
     alone = plan_poses(paper_scanner, t=BALL, n=8, limits=TURNED, settings=ALONE)
     hidden = resolvability(paper_scanner, alone.poses, T_HT=nominal_mount(), t=BALL, sigma=SIGMA_PX)
     assert {h.name for h in hidden.unresolved} == {"half a pixel low", "half a pixel high"}
@@ -81,13 +94,44 @@ def test_the_first_pose_is_repeated_and_limits_hold(turned_plan, paper_scanner):
     assert allowed(paper_scanner, poses, T_HT=nominal_mount(), t=BALL, limits=TURNED).all()
 
 
+def stated(scanner, plan, maker):
+    """Covariance that a calibration of the plan's poses states, which assumes the scatter that the plan assumes."""
+    poses, scatter = plan.poses, expected_scatter(maker)
+    x = project_ball(scanner, T_HT=nominal_mount(), T_MH=poses.T_MH, t=BALL, alpha=poses.alpha)
+    return calibrate(
+        scanner,
+        poses,
+        BallObservations.from_sigma(x, 0.0207 / np.sqrt(2), pose_id=poses.pose_id),
+        pose_noise=(scatter.translation, scatter.rotation),
+        hypotheses=False,
+    ).covariance
+
+
 def test_the_prediction_is_what_a_calibration_states(turned_plan, paper_scanner):
-    poses, sigma = turned_plan.poses, 0.0207 / np.sqrt(2)
-    x = project_ball(paper_scanner, T_HT=nominal_mount(), T_MH=poses.T_MH, t=BALL, alpha=poses.alpha)
-    cal = calibrate(
-        paper_scanner, poses, BallObservations.from_sigma(x, sigma, pose_id=poses.pose_id), hypotheses=False
+    np.testing.assert_allclose(
+        stated(paper_scanner, turned_plan, STILL), turned_plan.covariance, rtol=1e-6, atol=1e-16
     )
-    np.testing.assert_allclose(cal.covariance, turned_plan.covariance, rtol=1e-6, atol=1e-16)
+
+
+def test_the_prediction_holds_what_a_calibration_assumes(turned_plan, silent_scanner):
+    plan = plan_poses(silent_scanner, t=BALL, n=30, limits=TURNED, settings=DesignSettings(resolve=False))
+    C = stated(silent_scanner, plan, Repeatability())
+    assert C.shape == (21, 21)
+    np.testing.assert_allclose(C, plan.covariance, rtol=1e-5, atol=1e-16)
+    assert {"d_SR", "u_0", "eta"} <= plan.u.keys()
+    assert plan.predicted > 5 * plan.exact
+    assert plan.exact > turned_plan.predicted
+
+
+def test_a_goal_counts_what_nobody_stated(silent_scanner):
+    with pytest.raises(NotObservableError, match="state the sigmas of the scanner's values"):
+        plan_poses(silent_scanner, t=BALL, goal=0.005, limits=PlanLimits(total_time=400.0), settings=ALONE)
+
+
+def test_the_paper_plan_of_an_unstated_scanner_is_worse_than_two_angles(silent_scanner):
+    plan = plan_poses(silent_scanner, t=BALL, limits=TURNED, settings=ALONE)
+    assert len(plan) <= 60
+    assert plan.predicted < 0.1 * plan.reference
 
 
 def test_the_target_is_the_spread_of_simulated_scans(paper_scanner, rng):
@@ -157,7 +201,7 @@ def test_plans_are_deterministic(paper_scanner):
 
 def test_d_optimal_plans_shrink_the_volume(paper_scanner):
     a = plan_poses(paper_scanner, t=BALL, n=24, limits=TURNED, settings=ALONE)
-    d = plan_poses(paper_scanner, t=BALL, n=24, limits=TURNED, settings=DesignSettings(criterion="D", resolve=False))
+    d = plan_poses(paper_scanner, t=BALL, n=24, limits=TURNED, settings=DesignSettings(criterion="D", resolve=False, maker=STILL))
     assert np.linalg.slogdet(d.covariance)[1] < np.linalg.slogdet(a.covariance)[1]
     assert d.predicted > a.predicted
 

@@ -14,7 +14,7 @@ from tomopose.calibration.checks.convention_tests import Diagnosis, ranked, set_
 from tomopose.calibration.checks.conventions import ALTERNATIVES
 from tomopose.calibration.checks.placement import require_on_panel
 from tomopose.calibration.checks.scanner_tests import ScannerTests, rows_to_test, scanner_tests
-from tomopose.calibration.model.assumed import Assumed, assumed_for, with_assumed, without_effect
+from tomopose.calibration.model.assumed import Assumed, taken_as_known, without_effect
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS
 from tomopose.calibration.model.covariance import inverse_information, widening
 from tomopose.calibration.model.linear_fit import LinearFit
@@ -326,11 +326,8 @@ def rigid_calibration(
     plain = pair(scanner, poses, observations)
     require_on_panel(plain)
     no_effect = without_effect(plain.alpha, moving_scanner=arrangement == "moving-scanner")
-    assumed = tuple(
-        assumed_for(s, free=free, fix=fix, priors=dict(priors or {}), no_effect=no_effect) for s in plain.scanners
-    )
-    problem = replace(plain, scanners=tuple(with_assumed(s, a) for s, a in zip(plain.scanners, assumed, strict=True)))
-    freed = free_parameters(problem.scanners, free=free, fix=fix, priors=priors)
+    assumed, scanners, freed = taken_as_known(plain.scanners, free=free, fix=fix, priors=priors, no_effect=no_effect)
+    problem = replace(plain, scanners=scanners)
     try:
         stated, freed, against = _by_assumed(problem, freed, robust=robust, auto=auto)
     except ImpossibleScannerError:
@@ -353,7 +350,7 @@ def rigid_calibration(
         "robust": robust,
         "pose_noise": pose_noise if pose_noise is None or isinstance(pose_noise, str) else list(pose_noise),
     }
-    taken = Taken(assumed=assumed[0], contradicted=against)
+    taken = Taken(assumed=assumed, contradicted=against)
     found = _rigid(solution, stated, diagnosis, arrangement, arguments, taken)
     found = replace(found, scanner=replace(found.scanner, sigma=plain.scanner.sigma))
     if not found.converged and raise_on_failure:

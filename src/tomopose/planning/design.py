@@ -9,15 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tomopose.calibration.model.ball_projection import projection_blocks
+from tomopose.calibration.model.assumed import taken_as_known
+from tomopose.calibration.model.ball_projection import projection_blocks, whiteners
 from tomopose.calibration.model.covariance import inverse_information
-from tomopose.calibration.model.parameters import FreeParameters, free_parameters
+from tomopose.calibration.model.parameters import FreeParameters
 from tomopose.calibration.rigid.fit import tangent_names
+from tomopose.calibration.rigid.pose_noise import PoseNoise, expected_scatter, total_covariance
 from tomopose.errors import InputError, NotObservableError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.manipulator.real_poses import Repeatability
 from tomopose.planning.exchange import Chosen, Criterion, exchange
 from tomopose.planning.limits import PlanLimits, candidates
 from tomopose.planning.order import ordered, rows_of, run_time
@@ -47,8 +50,10 @@ RESOLVING_ROUNDS = 8
 class PosePlan:
     """Poses to image, in order, the first repeated at the end.
 
-    predicted:   scan reprojection error, px rms, that the calibration from these poses will cause.
-    reference:   the same of the paper's 189 poses under the same noise, table still.
+    predicted:   scan reprojection error, px rms, that the calibration from these poses will cause, with everything that
+                 it assumes: scanner values that nobody stated, the scatter of the poses.
+    exact:       the same if those scanner values were exact.
+    reference:   the same (`predicted`) of the paper's 189 poses under the same noise, table still.
     u:           predicted standard uncertainties by coordinate of the calibration's tangent (mm, rad, px).
     covariance:  (m, m) of all.
     resolved:    which alternative conventions these poses would show, or None where it was not asked for.
@@ -57,6 +62,7 @@ class PosePlan:
 
     poses: PoseSequence
     predicted: float
+    exact: float
     reference: float
     u: Mapping[str, float]
     covariance: Array
@@ -80,13 +86,18 @@ def pose_information(
     t: Array,
     sigma: float,
     free: FreeParameters | None = None,
+    scatter: PoseNoise | None = None,
 ) -> Array:
-    """(n, 2, m): whitened Jacobian of every pose by w_HT, t_HT, t and the freed parameters."""
+    """(n, 2, m): whitened Jacobian of every pose by w_HT, t_HT, t and the freed parameters; sigma: px, a coordinate."""
     b = projection_blocks(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=t, alpha=poses.alpha)
     parts = [b.J_mount, b.J_t]
     if free is not None and len(free):
         parts.append(b.J_scanner[:, :, free.cols] * free.factor)
-    return np.concatenate(parts, axis=2) / sigma
+    J = np.concatenate(parts, axis=2)
+    if scatter is None:
+        return J / sigma
+    detection = np.broadcast_to(sigma**2 * np.eye(2), (len(J), 2, 2))
+    return np.asarray(whiteners(total_covariance(detection, b, scatter)) @ J)
 
 
 def _prior_information(free: FreeParameters) -> Array:
@@ -103,9 +114,11 @@ def predicted_covariance(
     t: ArrayLike,
     sigma: float = SIGMA_PX,
     free: FreeParameters | None = None,
+    scatter: PoseNoise | None = None,
 ) -> Array:
     """(m, m): covariance of a calibration from these poses, before a single image is taken."""
-    L = pose_information(scanner, poses, T_HT=T_HT, t=np.asarray(t, dtype=np.float64), sigma=sigma, free=free)
+    ball = np.asarray(t, dtype=np.float64)
+    L = pose_information(scanner, poses, T_HT=T_HT, t=ball, sigma=sigma, free=free, scatter=scatter)
     N = np.einsum("kia,kib->ab", L, L)
     return inverse_information(N if free is None else N + _prior_information(free))
 
@@ -122,6 +135,7 @@ class DesignSettings:
     """How a plan is searched.
 
     sigma:     expected standard uncertainty of a centre's coordinate, px.
+    maker:     the manipulator's repeatability, from which a calibration assumes the scatter of the poses.
     criterion: "A": the scan reprojection error itself;  "D": the volume of the confidence region.
     resolve:   also see to it that the poses show every alternative convention that the limits let them show, by 5
                sigma, and find which they would not.
@@ -129,6 +143,7 @@ class DesignSettings:
     """
 
     sigma: float = SIGMA_PX
+    maker: Repeatability = Repeatability()
     criterion: Criterion = "A"
     resolve: bool = True
     seed: int = 0
@@ -144,6 +159,7 @@ class _Search:
 
     pool: candidates; L (n, 2, m): whitened rows of each; prior (m, m); T_HT, t: nominal mount and ball; goal: scan
     reprojection error, px rms, to reach with as few images as possible, where n, the number of images, is None.
+    counts: (m,) bool, coordinates that the goal counts: all of them, or all but the scanner values that are assumed.
     """
 
     scanner: Scanner
@@ -157,6 +173,11 @@ class _Search:
     prior: Array
     n: int | None
     goal: float
+    counts: Any
+
+    def rms(self, index: Any) -> float:
+        """Scan reprojection error, px rms, of the candidates `index` by the coordinates that count, others exact."""
+        return _rms(self.target, self.L[index], self.prior, self.counts)
 
     def choose(self, k: int, must: list[int]) -> Chosen:
         """k images, those of `must` among them (half of k at most), one pose twice: the first, which ends the run."""
@@ -174,11 +195,12 @@ class _Search:
 
     def design(self, must: list[int]) -> tuple[PoseSequence, Chosen]:
         """Poses in the order in which they are driven, within the time allowed."""
-        most, least = _largest_affordable(self.limits), len(self.prior)
+        most = _largest_affordable(self.limits)
+        least = int((np.diag(self.prior) == 0).sum())
         if self.n is not None:
             chosen = self.choose(_checked(self.n, most), must)
         else:
-            chosen = _fewest(lambda k: self.choose(k, must), self.target, self.goal, most, least)
+            chosen = _fewest(lambda k: self.choose(k, must), self.rms, self.goal, most, least)
         poses = ordered(rows_of(self.pool, chosen.index), self.limits)
         allowed = self.limits.total_time
         while allowed is not None and run_time(poses, self.limits) > allowed and len(poses) > least:
@@ -227,7 +249,8 @@ def plan_poses(
     T_HT, t:   nominal mount (default R_z(pi)) and ball centre in M, mm: roughly is enough.  A ball on the pivot hides
                mistakes; the default is 20 mm off.
     n, goal:   number of images (the repeated first one included), or the scan reprojection error, px rms, to reach with
-               as few as possible (default: what the paper's 189 poses reach).
+               as few as possible, everything assumed included.  Default: what the paper's 189 poses reach where the
+               scanner's values are exact, in the share of mount and ball.
     limits:    travel, table angles, field of view, magnification, boxes, time.
     scan, points: what the calibration is for: the scan's poses and the object's points (p, 3) in W, mm
                (default: the paper's tilted scan, eq. (11), and a box of +-15, +-15, +-30 mm).
@@ -242,29 +265,33 @@ def plan_poses(
     ball = np.asarray(t, dtype=np.float64).reshape(3)
     limits = PlanLimits() if limits is None else limits
     settings = DesignSettings() if settings is None else settings
-    freed = free_parameters((scanner,), free=free, priors=priors)
+    assumed, _, freed = taken_as_known((scanner,), free=free, priors=priors)
     target = scan_target(scanner, T_HT=T_HT, scan=scan, points=points, free=freed)
     pool = candidates(scanner, T_HT=T_HT, t=ball, limits=limits)
-    noise: dict[str, Any] = {"T_HT": T_HT, "t": ball, "sigma": settings.sigma}
-    L = pose_information(scanner, pool, free=freed, **noise)
+    noise: dict[str, Any] = {
+        "T_HT": T_HT, "t": ball, "sigma": settings.sigma, "free": freed, "scatter": expected_scatter(settings.maker)
+    }  # fmt: skip
+    L = pose_information(scanner, pool, **noise)
     prior = _prior_information(freed)
     _require_determined(L, prior, target)
-    reference = scan_target(scanner, T_HT=T_HT, scan=scan, points=points).rms(
-        predicted_covariance(scanner, pose_grid(3), **noise)
-    )
+    defaults = {a.name for a in assumed if a.source == "default"}
+    exact = np.array([True] * 9 + [name not in defaults for name in freed.names])
+    paper = pose_information(scanner, pose_grid(3), **noise)
     search = _Search(
         scanner=scanner, T_HT=T_HT, t=ball, limits=limits, settings=settings, target=target, pool=pool, L=L,
-        prior=prior, n=n, goal=reference if goal is None else goal,
+        prior=prior, n=n, goal=_rms(target, paper, prior, np.arange(len(prior)) < 9) if goal is None else goal,
+        counts=exact if goal is None else np.ones(len(prior), dtype=bool),
     )  # fmt: skip
     poses, chosen = search.design([])
     resolved = None
     if settings.resolve:
         poses, resolved = search.resolving(poses, chosen)
-    covariance = predicted_covariance(scanner, poses, free=freed, **noise)
+    covariance = predicted_covariance(scanner, poses, **noise)
     return PosePlan(
         poses=poses,
         predicted=target.rms(covariance),
-        reference=reference,
+        exact=_rms(target, pose_information(scanner, poses, **noise), prior, exact),
+        reference=target.rms(predicted_covariance(scanner, pose_grid(3), **noise)),
         u=dict(zip(tangent_names((0,), freed), np.sqrt(np.diag(covariance)).tolist(), strict=True)),
         covariance=covariance,
         resolved=resolved,
@@ -302,22 +329,29 @@ def _require_determined(L: Array, prior: Array, target: ScanTarget) -> None:
         )
 
 
-def _fewest(choose: Any, target: ScanTarget, wanted: float, most: int, m: int) -> Chosen:
+def _rms(target: ScanTarget, L: Array, prior: Array, counts: Any) -> float:
+    """Scan reprojection error, px rms, of poses with the rows L (n, 2, m) by the coordinates that count, others exact."""
+    N = np.einsum("kia,kib->ab", L, L) + prior
+    part = np.ix_(counts, counts)
+    return float(np.sqrt(max(np.trace(target.M[part] @ inverse_information(N[part])), 0.0)))
+
+
+def _fewest(choose: Any, rms: Any, wanted: float, most: int, m: int) -> Chosen:
     """The smallest design that reaches the goal: doubling, then bisection."""
     low, high = max(6, m // 2 + 2), max(12, m)
     design = choose(min(high, most))
-    while target.rms(design.covariance) > wanted:
+    while rms(design.index) > wanted:
         if high >= most:
             raise NotObservableError(
-                f"{most} images reach {target.rms(design.covariance):.3g} px, not the {wanted:.3g} px asked for; widen "
-                "the limits, allow table angles, or lower the goal",
+                f"{most} images reach {rms(design.index):.3g} px, not the {wanted:.3g} px asked for; allow more table "
+                "angles or travel, state the sigmas of the scanner's values, or lower the goal",
             )
         low, high = high, min(2 * high, most)
         design = choose(high)
     while high - low > 1:
         middle = (low + high) // 2
         trial = choose(middle)
-        if target.rms(trial.covariance) <= wanted:
+        if rms(trial.index) <= wanted:
             high, design = middle, trial
         else:
             low = middle

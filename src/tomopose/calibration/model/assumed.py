@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Literal, TypeAlias
 
+from tomopose.calibration.model.parameters import FreeParameters, free_parameters
 from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 from tomopose.units import Array
 
@@ -134,3 +135,19 @@ def assumed_for(
             a = replace(a, sigma=float(priors[a.name]), source="option")
         found.append(a)
     return tuple(found)
+
+
+def taken_as_known(
+    scanners: tuple[Scanner, ...],
+    *,
+    free: Iterable[str] = (),
+    fix: Iterable[str] = (),
+    priors: Mapping[str, float] | None = None,
+    no_effect: Iterable[str] = (),
+) -> tuple[tuple[Assumed, ...], tuple[Scanner, ...], FreeParameters]:
+    """(what is assumed of the first scanner, the scanners with it, what is estimated) of a calibration and of a plan
+    that predicts it; arguments as of `assumed_for`."""
+    free, fix, priors, no_effect = tuple(free), tuple(fix), dict(priors or {}), tuple(no_effect)
+    assumed = [assumed_for(s, free=free, fix=fix, priors=priors, no_effect=no_effect) for s in scanners]
+    known = tuple(with_assumed(s, a) for s, a in zip(scanners, assumed, strict=True))
+    return assumed[0], known, free_parameters(known, free=free, fix=fix, priors=priors)

@@ -173,6 +173,15 @@ def _prior(s: Array, maker: float) -> Array:
     return np.asarray(1.0 / ((0.2 + q) * (1.0 + q**2) ** 2))
 
 
+def expected_scatter(maker: Repeatability | None = None) -> PoseNoise:
+    """Root mean of the prior: the scatter that is assumed before an image is taken; maker: default as above."""
+    maker = Repeatability() if maker is None else maker
+    q = np.concatenate([[0.0], np.geomspace(1e-4, 100.0, 600)])
+    weight = _prior(q, 1.0) * _widths(q)
+    times = math.sqrt(float((weight * q**2).sum() / weight.sum()))
+    return PoseNoise(translation=times * maker.t_mm, rotation=times * maker.w_rad, found=False)
+
+
 def _widths(s: Array) -> Array:
     """Weights of the trapezoidal rule."""
     return np.gradient(s) if len(s) > 1 else np.ones(1)
