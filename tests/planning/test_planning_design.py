@@ -108,9 +108,7 @@ def stated(scanner, plan, maker):
 
 
 def test_the_prediction_is_what_a_calibration_states(turned_plan, paper_scanner):
-    np.testing.assert_allclose(
-        stated(paper_scanner, turned_plan, STILL), turned_plan.covariance, rtol=1e-6, atol=1e-16
-    )
+    np.testing.assert_allclose(stated(paper_scanner, turned_plan, STILL), turned_plan.covariance, rtol=1e-6, atol=1e-16)
 
 
 def test_the_prediction_holds_what_a_calibration_assumes(turned_plan, silent_scanner):
@@ -201,7 +199,9 @@ def test_plans_are_deterministic(paper_scanner):
 
 def test_d_optimal_plans_shrink_the_volume(paper_scanner):
     a = plan_poses(paper_scanner, t=BALL, n=24, limits=TURNED, settings=ALONE)
-    d = plan_poses(paper_scanner, t=BALL, n=24, limits=TURNED, settings=DesignSettings(criterion="D", resolve=False, maker=STILL))
+    d = plan_poses(
+        paper_scanner, t=BALL, n=24, limits=TURNED, settings=DesignSettings(criterion="D", resolve=False, maker=STILL)
+    )
     assert np.linalg.slogdet(d.covariance)[1] < np.linalg.slogdet(a.covariance)[1]
     assert d.predicted > a.predicted
 

@@ -22,7 +22,12 @@ GIMBAL_COSINE = 1e-9
 
 
 def _stack(rows: list[list[Array]]) -> Array:
-    return np.stack([np.stack(np.broadcast_arrays(*row), axis=-1) for row in rows], axis=-2)
+    shape = np.broadcast_shapes(*(np.shape(x) for row in rows for x in row))
+    M = np.empty((*shape, len(rows), len(rows[0])))
+    for i, row in enumerate(rows):
+        for j, x in enumerate(row):
+            M[..., i, j] = x
+    return M
 
 
 def R_x(alpha: Array | float) -> Array:

@@ -176,13 +176,11 @@ class Scanner:
     def T_TW(self, alpha: Array | float) -> RigidTransform:
         """Table to world at table angle alpha (rad): a turn about the table axis, the identity at 0.  Paper sec. 3."""
         alpha = np.asarray(alpha, dtype=np.float64)
-        turn = RigidTransform(R=R_z(alpha), t=np.zeros((*alpha.shape, 3)), source=Frame.W, target=Frame.W)
-        moved = (
-            turn
-            if self.axis_y == self.axis_tilt_x == self.axis_tilt_y == 0.0
-            else (self.table_axis @ turn @ self.table_axis.inv)
-        )
-        return RigidTransform(R=moved.R, t=moved.t, source=Frame.T, target=Frame.W)
+        if self.axis_y == self.axis_tilt_x == self.axis_tilt_y == 0.0:
+            return RigidTransform(R=R_z(alpha), t=np.zeros((*alpha.shape, 3)), source=Frame.T, target=Frame.W)
+        axis = self.table_axis
+        R = axis.R @ R_z(alpha) @ axis.R.T
+        return RigidTransform(R=R, t=axis.t - R @ axis.t, source=Frame.T, target=Frame.W)
 
     def binned(self, factor: int) -> Scanner:
         """The scanner of images averaged over factor x factor pixels.

@@ -21,7 +21,7 @@ import numpy as np
 
 from tomopose.calibration.checks.alternative import Alternative
 from tomopose.calibration.checks.conventions import ALTERNATIVES, ALTERNATIVES_OF_MOVING_SCANNER
-from tomopose.calibration.checks.placement import Placement, better_placed, placement
+from tomopose.calibration.checks.placement import Placement, beams, better_placed, placement
 from tomopose.calibration.checks.stability import SIGNIFICANT, Effect, chi2_with_movements, movements
 from tomopose.calibration.model.parameters import UNITS, FreeParameters, free_parameters
 from tomopose.calibration.model.problem import Problem, pair
@@ -60,6 +60,13 @@ robots' tables 0.2 to 0.7), and chi2 lowered by the factor DECISIVE, that is, re
 
 ITERATIONS = 20
 """An alternative that is right needs fewer; one that is wrong is not worth more."""
+
+FIRST_ROWS, HOPELESS = 48, 100.0
+"""Where there are more than twice as many rows, an alternative is fitted to so many of them first; one that then leaves
+so many times the declared reading's chi2 (or dof) in all rows is wrong, and is not fitted to all of them."""
+
+SCANNER_GAIN = 1e3
+"""Values of the scanner that were off by 30 times what is assumed of them would lower chi2 so much."""
 
 MUCH_BETTER = 2.0
 """An alternative that fits better and lowers chi2 (floored at dof) by this factor makes a calibration untrustworthy."""
@@ -226,25 +233,51 @@ def other_unit_words(h: Hypothesis, declared: Hypothesis) -> str:
     )
 
 
-def _rms(problem: Problem, fit: Fit, free: FreeParameters) -> float:
-    r = residuals(problem, free, fit)
-    return float(np.sqrt((r**2).sum(axis=1).mean()))
+@dataclass(frozen=True, kw_only=True)
+class _Left:
+    """What a fit leaves.  d_rms: px;  sigmas: rms residual of a coordinate in stated standard uncertainties, of the
+    80 % of the centres that fit best;  share: d_rms over the rms spread of the centres."""
 
+    d_rms: float
+    sigmas: float
+    share: float
 
-def _share(problem: Problem, fit: Fit, free: FreeParameters) -> float:
-    """d_rms over the rms spread of the centres."""
-    spread = float(np.sqrt(((problem.x_D - problem.x_D.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    return _rms(problem, fit, free) / spread if spread > 0 else 0.0
+    @classmethod
+    def of(cls, problem: Problem, free: FreeParameters, fit: Fit) -> _Left:
+        r = residuals(problem, free, fit)
+        d2 = np.sort(whitened2(problem, r))
+        kept = d2[: max(1, int(np.ceil(BELONGING * len(d2))))]
+        d_rms = float(np.sqrt((r**2).sum() / len(r)))
+        spread = float(np.sqrt(((problem.x_D - problem.x_D.mean(axis=0)) ** 2).sum() / len(r)))
+        return cls(
+            d_rms=d_rms,
+            sigmas=float(np.sqrt(kept.mean() / BELONGING_MEAN)),
+            share=d_rms / spread if spread > 0 else 0.0,
+        )
 
 
 def residual_sigmas(problem: Problem, free: FreeParameters, fit: Fit) -> float:
     """rms residual of a coordinate in stated standard uncertainties, of the 80 % of the centres that fit best."""
-    d2 = np.sort(whitened2(problem, residuals(problem, free, fit)))
-    kept = d2[: max(1, int(np.ceil(BELONGING * len(d2))))]
-    return float(np.sqrt(kept.mean() / BELONGING_MEAN))
+    return _Left.of(problem, free, fit).sigmas
 
 
-def _fit_alternative(problem: Problem, rays: Rays, free: FreeParameters, held: FreeParameters, starts: int) -> Fit:
+def _fit_alternative(
+    problem: Problem, rays: Rays, free: FreeParameters, held: FreeParameters, starts: int, hopeless: float
+) -> Fit:
+    """The optimum under an alternative, or where part of the rows lead if that leaves a hopeless chi2 in all rows."""
+    if starts or len(problem) <= 2 * FIRST_ROWS or len(problem.ball_ids) > 1:
+        return _optimum(problem, rays, free, held, starts, np.inf)
+    rows = np.unique(np.linspace(0, len(problem) - 1, FIRST_ROWS).round().astype(int))
+    few = Rays(n=rays.n[rows], d=rays.d[rows], source=rays.source)
+    part = _optimum(problem.select(rows), few, free, held, 0, SCANNER_GAIN * hopeless * len(rows) / len(problem))
+    whole = minimise(problem, free, part, iterations=0)
+    return minimise(problem, free, whole, iterations=ITERATIONS) if whole.chi2 < hopeless else whole
+
+
+def _optimum(
+    problem: Problem, rays: Rays, free: FreeParameters, held: FreeParameters, starts: int, enough: float
+) -> Fit:
+    """The optimum under an alternative; one that leaves more than `enough` with the scanner held ends there."""
     start = closed_form(problem, rays)
     fit = minimise(problem, held, start, iterations=ITERATIONS)
     if not np.isfinite(fit.chi2):
@@ -256,7 +289,7 @@ def _fit_alternative(problem: Problem, rays: Rays, free: FreeParameters, held: F
             for start in itertools.islice(other_starts(problem, rays), starts)
         )
         fit = minimise(problem, held, min((fit, *others), key=lambda one: one.chi2))
-    return minimise(problem, free, fit, iterations=ITERATIONS) if len(free) else fit
+    return minimise(problem, free, fit, iterations=ITERATIONS) if len(free) and fit.chi2 < enough else fit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,6 +300,7 @@ class _Declared:
     free: FreeParameters
     fit: Fit
     placed: Placement
+    beam: Array
 
     @property
     def n_prior(self) -> int:
@@ -290,11 +324,12 @@ class _Declared:
 
     @functools.cached_property
     def own(self) -> Hypothesis:
+        left = _Left.of(self.problem, self.free, self.fit)
         return Hypothesis(
             name="declared",
             words="the data as declared",
             remedy="",
-            d_rms=_rms(self.problem, self.fit, self.free),
+            d_rms=left.d_rms,
             chi2=self.fit.chi2,
             dof=self.dof(self.problem),
             sigmas=self.sigmas(),
@@ -304,7 +339,7 @@ class _Declared:
             ball_mm=self.placed.median,
             d_SR=self.placed.d_SR,
             possible=self.placed.possible,
-            share=_share(self.problem, self.fit, self.free),
+            share=left.share,
         )
 
 
@@ -323,14 +358,17 @@ def ranked(
     """
     held = free_parameters(problem.scanners, fix=tuple(UNITS))
     rays = ray_equations(problem)
-    declared = _Declared(problem=problem, free=free, fit=fit, placed=placement(problem, fit))
+    beam = beams(problem)
+    declared = _Declared(problem=problem, free=free, fit=fit, placed=placement(problem, fit, beam), beam=beam)
     found = [declared.own]
+    hopeless = HOPELESS * max(fit.chi2, float(declared.own.dof))
     for alternative in alternatives:
         changed = alternative.change(problem)
         if changed is None or declared.dof(changed) <= 0:
             continue
         same_rays = changed.x_D is problem.x_D and changed.alpha is problem.alpha
-        other = _fit_alternative(changed, rays if same_rays else ray_equations(changed), free, held, starts)
+        changed_rays = rays if same_rays else ray_equations(changed)
+        other = _fit_alternative(changed, changed_rays, free, held, starts, hopeless)
         if not np.isfinite(other.chi2):
             continue
         judged = _judged_beside_movements(declared, alternative, changed, other)
@@ -391,7 +429,9 @@ def _judged(
 ) -> Hypothesis | None:
     """The comparison of one alternative; None where it puts a ball where none can be, or only renames the unit."""
     free = declared.free
-    placed = placement(changed, other)
+    same = changed.alpha is declared.problem.alpha and len(changed) == len(declared.problem)
+    placed = placement(changed, other, declared.beam if same else None)
+    left = _Left.of(changed, free, other)
     dof = declared.dof(changed)
     judged = compared(
         declared.hypothesis(chi2),
@@ -399,11 +439,11 @@ def _judged(
             name=alternative.name,
             words=alternative.words,
             remedy=alternative.remedy,
-            d_rms=_rms(changed, other, free),
+            d_rms=left.d_rms,
             chi2=other.chi2,
             dof=dof,
             # a chi2 that follows a movement says what the reading leaves beside it
-            sigmas=min(residual_sigmas(changed, free, other), float(np.sqrt(other.chi2 / dof))),
+            sigmas=min(left.sigmas, float(np.sqrt(other.chi2 / dof))),
             delta=0.0,
             factor=1.0,
             outcome="worse",
@@ -412,7 +452,7 @@ def _judged(
             ball_mm=placed.median,
             d_SR=placed.d_SR,
             possible=placed.possible,
-            share=_share(changed, other, free),
+            share=left.share,
         ),
     )
     likelier = better_placed(placed, declared.placed) and not changed.units_confirmed

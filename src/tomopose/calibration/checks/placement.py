@@ -45,21 +45,28 @@ class Placement:
         return self.possible and self.off_axis < np.log(LIKELY)
 
 
-def depths(problem: Problem, fit: Fit) -> Array:
-    """(n,) mm: distance of the ball from the focal spot along the beam, in every pose."""
-    x_H = (problem.R_MH @ fit.t[problem.ball][:, :, None])[..., 0] + problem.t_MH
-    x_T = x_H @ fit.R_HT.T + fit.t_HT
-    found = np.empty(len(problem))
+def beams(problem: Problem) -> Array:
+    """(n, 4): direction of the beam in T and offset, which give a point's distance from the focal spot along it, mm."""
+    found = np.empty((len(problem), 4))
     for r, scanner in enumerate(problem.scanners):
         mine = problem.run == r
-        T_TS = scanner.T_WS @ scanner.T_TW(problem.alpha[mine])
-        found[mine] = np.einsum("nj,nj->n", T_TS.R[:, 2], x_T[mine]) + T_TS.t[:, 2]
+        alpha, which = np.unique(problem.alpha[mine], return_inverse=True)
+        T_TS = scanner.T_WS @ scanner.T_TW(alpha)
+        found[mine] = np.column_stack([T_TS.R[:, 2], T_TS.t[:, 2]])[which.reshape(-1)]
     return found
 
 
-def placement(problem: Problem, fit: Fit) -> Placement:
-    """Of a fit."""
-    z = depths(problem, fit)
+def depths(problem: Problem, fit: Fit, beam: Array | None = None) -> Array:
+    """(n,) mm: distance of the ball from the focal spot along the beam, in every pose; beam: of `beams`, if known."""
+    x_H = (problem.R_MH @ fit.t[problem.ball][:, :, None])[..., 0] + problem.t_MH
+    x_T = x_H @ fit.R_HT.T + fit.t_HT
+    beam = beams(problem) if beam is None else beam
+    return np.asarray((beam[:, :3] * x_T).sum(axis=1) + beam[:, 3])
+
+
+def placement(problem: Problem, fit: Fit, beam: Array | None = None) -> Placement:
+    """Of a fit; beam: of `beams`, if known."""
+    z = depths(problem, fit, beam)
     first = problem.scanners[problem.run[0]]
     return Placement(
         nearest=float(z.min()),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,8 +11,10 @@ import numpy as np
 
 from tomopose.calibration.model.ball_projection import scanner_vector, whiteners
 from tomopose.errors import InputError
+from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import rotation_angle_between, rotation_from_convention
 from tomopose.geometry.scanner import Scanner
+from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PIVOT_TOLERANCE_MM, PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.units import Array
@@ -64,10 +67,15 @@ class Problem:
     def scanner(self) -> Scanner:
         return self.scanners[0]
 
-    @property
+    @functools.cached_property
     def s_0(self) -> Array:
         """(runs, 13) scanner vectors at nominal values."""
         return np.array([scanner_vector(s) for s in self.scanners])
+
+    @functools.cached_property
+    def T_MH(self) -> RigidTransform:
+        """The poses."""
+        return RigidTransform(R=self.R_MH, t=self.t_MH, source=Frame.M, target=Frame.H)
 
     def select(self, keep: Any) -> Problem:
         """The observations with those indices (or that mask)."""

@@ -109,7 +109,7 @@ def blocks(problem: Problem, free: FreeParameters, fit: Fit) -> ProjectionBlocks
     return projection_blocks(
         adjusted_scanners(problem.scanners, free, fit.delta),
         T_HT=fit.T_HT,
-        T_MH=RigidTransform(R=problem.R_MH, t=problem.t_MH, source=Frame.M, target=Frame.H),
+        T_MH=problem.T_MH,
         t=fit.t[problem.ball],
         alpha=problem.alpha,
         translation_scale=translation_scale(free, fit.delta),

@@ -47,10 +47,10 @@ def shares_of(
     J: Array, covariance: Array, columns: dict[str, list[int]]
 ) -> tuple[float, float, list[tuple[str, float]]]:
     """(total, measured, shares): J (k, c) px of the scan, covariance (c, c), columns of what was assumed, by name."""
-    k = max(len(J), 1)
+    M = J.T @ J / max(len(J), 1)
 
     def rms(C: Array) -> float:
-        return float(np.sqrt(max(np.einsum("kc,cd,kd->", J, C, J, optimize=True) / k, 0.0)))
+        return float(np.sqrt(max((M * C).sum(), 0.0)))
 
     def known(C: Array, which: list[int]) -> Array:
         """The covariance if those coordinates were exact."""
@@ -75,7 +75,7 @@ def scan_budget(calibration: Calibration, problem: Problem, linear: LinearFit) -
     if isinstance(calibration.errors, TwinErrors):
         return None
     own = PoseSequence(
-        T_MH=RigidTransform(R=problem.R_MH, t=problem.t_MH, source=Frame.M, target=Frame.H),
+        T_MH=problem.T_MH,
         pose_id=problem.pose_id,
         alpha=problem.alpha,
     )
@@ -123,7 +123,7 @@ def _with_two_angles(
     b = projection_blocks(
         calibration.scanner,
         T_HT=calibration.T_HT,
-        T_MH=RigidTransform(R=problem.R_MH, t=problem.t_MH, source=Frame.M, target=Frame.H),
+        T_MH=problem.T_MH,
         t=calibration.t,
         alpha=problem.alpha + np.pi / 2,
     )

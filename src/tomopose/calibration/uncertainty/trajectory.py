@@ -108,23 +108,25 @@ def _columns(calibration: Calibration, poses: PoseSequence, x_M: Array) -> tuple
     T_MH = fixed.poses.T_MH
     n, m, c = len(poses), len(x_M), len(names)
     J = np.zeros((n, m, 2, c + (0 if unseen is None else len(unseen.names))))
-    J_pose = np.zeros((n, m, 2, 6))
-    rigid_pose = np.zeros((n, m, 2, 6))
     freed = [(j, name.split("[")[0]) for j, name in enumerate(names)]
     errors = [names.index(name) for name in fixed.names]
     alpha = np.zeros(n) if poses.alpha is None else poses.alpha
-    for i in range(m):
-        b = projection_blocks(scanner, T_HT=calibration.T_HT, T_MH=T_MH, t=x_M[i], alpha=alpha)
-        J_pose[:, i] = np.concatenate([-b.G_H @ skew(b.x_H - T_MH.t), b.G_H], axis=2)
-        rigid_pose[:, i] = np.concatenate([-b.J_t @ skew(x_M[i]), b.J_t], axis=2)
-        J[:, i, :, :6] = b.J_mount
-        J[:, i, :, errors] = np.moveaxis(J_pose[:, i] @ fixed.J, 2, 0)
-        for j, name in freed:
-            if name in SCANNER_COLUMNS or name == "pitch_ratio":
-                column, factor = ("p_u", scanner.p_v) if name == "pitch_ratio" else (name, 1.0)
-                J[:, i, :, j] = b.J_scanner[:, :, SCANNER_COLUMNS.index(column)] * factor
-        if unseen is not None:
-            J[:, i, :, c:] = unseen_columns(unseen.names, b, T_HT=calibration.T_HT, origin=T_MH.t, alpha=alpha)
+    # every pose with every point, poses first: one projection of all of them
+    pose = np.repeat(np.arange(n), m)
+    x = np.tile(x_M, (n, 1))
+    b = projection_blocks(scanner, T_HT=calibration.T_HT, T_MH=T_MH[pose], t=x, alpha=alpha[pose])
+    J_pose = np.concatenate([-b.G_H @ skew(b.x_H - T_MH.t[pose]), b.G_H], axis=2).reshape(n, m, 2, 6)
+    rigid_pose = np.concatenate([-b.J_t @ skew(x), b.J_t], axis=2)
+    J[..., :6] = b.J_mount.reshape(n, m, 2, 6)
+    if errors:
+        J[..., errors] = J_pose @ fixed.J[:, None]
+    for j, name in freed:
+        if name in SCANNER_COLUMNS or name == "pitch_ratio":
+            column, factor = ("p_u", scanner.p_v) if name == "pitch_ratio" else (name, 1.0)
+            J[..., j] = (b.J_scanner[:, :, SCANNER_COLUMNS.index(column)] * factor).reshape(n, m, 2)
+    if unseen is not None:
+        of_q = unseen_columns(unseen.names, b, T_HT=calibration.T_HT, origin=T_MH.t[pose], alpha=alpha[pose])
+        J[..., c:] = of_q.reshape(n, m, 2, -1)
     G = rigid_pose.reshape(-1, 6)
     Q, _ = np.linalg.qr(G / np.linalg.norm(G, axis=0))
     flat = J.reshape(-1, J.shape[3])
