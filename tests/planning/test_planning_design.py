@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tomopose import Scanner
+from tomopose.calibration.rigid.pose_noise import expected_scatter
 from tomopose.calibration.solve import calibrate
 from tomopose.errors import InputError, NotObservableError, OutOfReachError
-from tomopose.calibration.rigid.pose_noise import expected_scatter
 from tomopose.geometry.projection import project_ball
 from tomopose.manipulator.real_poses import Repeatability
 from tomopose.observations import BallObservations

@@ -330,7 +330,7 @@ def _require_determined(L: Array, prior: Array, target: ScanTarget) -> None:
 
 
 def _rms(target: ScanTarget, L: Array, prior: Array, counts: Any) -> float:
-    """Scan reprojection error, px rms, of poses with the rows L (n, 2, m) by the coordinates that count, others exact."""
+    """Scan error, px rms, of poses with the rows L (n, 2, m) by the coordinates that count, others exact."""
     N = np.einsum("kia,kib->ab", L, L) + prior
     part = np.ix_(counts, counts)
     return float(np.sqrt(max(np.trace(target.M[part] @ inverse_information(N[part])), 0.0)))
