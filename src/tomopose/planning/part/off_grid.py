@@ -1,0 +1,53 @@
+"""Views moved off the grid of candidates: table angle, tilts and lift of each by half steps, as long as J gains.
+
+The tolerance of a tangent is finer than the grid, so a view of the grid often misses faces by a fraction of a degree.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tomopose.planning.part.choose import without_each
+from tomopose.planning.part.settings import WEIGHTS
+from tomopose.planning.part.stations import Machine, allowed
+from tomopose.planning.part.worth import Goal, Views, table
+from tomopose.units import Array
+
+ROUNDS = 2
+"""Each halves the steps of the one before."""
+LIFT_STEP_MM = 2.0
+
+
+def refine_off_grid(goal: Goal, machine: Machine, q: Array, views: Views) -> tuple[Array, Views]:
+    """(q (n, 7), their tables): no view worth less for J than before, all within limits, in view and clear."""
+    q, w, m, n = q.copy(), goal.w, len(goal.x), len(q)
+    A, tau, incidence = (np.array(a) for a in (views.A, views.tau, views.incidence))
+    s = goal.settings
+    full = np.array([s.alpha_step, s.tilt_step, s.tilt_step, LIFT_STEP_MM])
+    for halving in range(1, ROUNDS + 1):
+        for i in range(n):
+            best, second, who = without_each(A, np.arange(n))
+            base = np.where(who == i, second, best)
+            around = _neighbours(machine, q[i], full / 2**halving)
+            around = around[allowed(machine, goal.part, around, margin=s.margin)]
+            if not len(around):
+                continue
+            tried = table(goal, machine.matrices(around))
+            gains = [float(w @ np.maximum(a - base, 0)) + WEIGHTS[2] * M / n for a, M in zip(tried.A, tried.M, strict=True)]
+            own = float(w @ np.maximum(A[i] - base, 0)) + WEIGHTS[2] * float(tau[i].mean()) / n
+            k = int(np.argmax(gains))
+            if gains[k] > own + 1e-9:
+                q[i], A[i], tau[i], incidence[i] = around[k], tried.A[k], tried.tau[k], tried.incidence[k]
+    assert A.shape[1] == m + len(goal.x_tuy) * len(goal.planes)
+    return q, Views(A=A, tau=tau, incidence=incidence)
+
+
+def _neighbours(machine: Machine, q: Array, step: Array) -> Array:
+    """(k, 7): one step up and down along alpha, rx, ry and z each, within the limits."""
+    columns = (6, 3, 4, 2)
+    moved = np.repeat(q[None], 2 * len(columns), axis=0)
+    for k, column in enumerate(columns):
+        moved[2 * k, column] += step[k]
+        moved[2 * k + 1, column] -= step[k]
+    moved = machine.clipped(moved)
+    return moved[(np.abs(moved - q) > 1e-12).any(axis=1)]

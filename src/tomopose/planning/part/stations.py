@@ -1,0 +1,167 @@
+"""Where a view may be taken from: table angle and plate pose within the limits, in view, and clear of obstacles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tomopose.errors import InputError, OutOfReachError
+from tomopose.geometry.projection import eq5_matrices, project
+from tomopose.geometry.rotations import rotation_from_convention
+from tomopose.geometry.scanner import Scanner
+from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.poses import PoseSequence
+from tomopose.planning.part.keep_out import Obstacle, hits
+from tomopose.planning.part.part import Part
+from tomopose.planning.part.settings import PartSettings
+from tomopose.trajectory.feasibility import AXES, TravelLimits, in_view
+from tomopose.units import Array
+
+FULL_TURN = 2 * np.pi
+LIFTS = 3
+"""Heights of the plate among the candidates where it can move by more than a millimetre."""
+CORNER = np.sqrt(2.0)
+"""Both tilt axes together reach farther than each: to the corner of their box."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Machine:
+    """What moves the part, and within what.
+
+    limits: x, y, z mm, angles of R_x R_y R_z and table, rad; a table interval of 360 deg or more turns freely.
+    pivot:  of the manipulator, as `PoseSequence` has it.
+    """
+
+    scanner: Scanner
+    T_HT: RigidTransform
+    limits: TravelLimits
+    obstacles: tuple[Obstacle, ...] = ()
+    pivot: Array | None = None
+
+    @property
+    def turns_freely(self) -> bool:
+        return bool(self.limits.high[6] - self.limits.low[6] >= FULL_TURN * (1 - 1e-9))
+
+    def clipped(self, q: Array) -> Array:
+        """Axes (n, 7) drawn to their limits; a free table to the turn that begins at its lower limit."""
+        out = np.clip(q, self.limits.low, self.limits.high)
+        if self.turns_freely:
+            low = self.limits.low[6] if np.isfinite(self.limits.low[6]) else 0.0
+            out[:, 6] = low + np.mod(q[:, 6] - low, FULL_TURN)
+        return out
+
+    def poses(self, q: Array) -> PoseSequence:
+        """Set poses of axes (n, 7): x, y, z mm, angles of R_x R_y R_z rad, table angle rad."""
+        found = PoseSequence.from_table(q[:, :3], np.degrees(q[:, 3:6]), alpha=q[:, 6], source="set")
+        return PoseSequence(
+            T_MH=found.T_MH,
+            pose_id=tuple(str(j) for j in range(len(q))),
+            alpha=found.alpha,
+            pivot=self.pivot,
+            convention=found.convention,
+            source="set",
+        )
+
+    def matrices(self, q: Array) -> Array:
+        """(n, 3, 4): points of the part at home, mm in W, to pixels.  Eq. (5)."""
+        poses = self.poses(q)
+        return eq5_matrices(self.scanner, T_HT=self.T_HT, T_MH=poses.T_MH, alpha=q[:, 6])
+
+
+def allowed(machine: Machine, part: Part, q: Array, *, margin: float) -> np.ndarray:
+    """(n,) bool: the whole part on the panel, between source and panel, and clear of the obstacles."""
+    P = machine.matrices(q)
+    depth = np.einsum("nj,mj->nm", P[:, 2, :3], part.hull) + P[:, 2, 3:]
+    good = (depth > 0).all(axis=1) & (depth < machine.scanner.d_SD).all(axis=1)
+    seen = in_view(P, part.hull, n_u=machine.scanner.n_u, n_v=machine.scanner.n_v, margin=margin).all(axis=1)
+    good &= seen
+    for obstacle in machine.obstacles:
+        index = np.flatnonzero(good)
+        good[index] &= ~hits(obstacle, part.hull, _motions(machine, q[index]))
+    return np.asarray(good)
+
+
+def _motions(machine: Machine, q: Array) -> tuple[RigidTransform, RigidTransform]:
+    """(part at home in W -> W, table -> W) of axes (n, 7)."""
+    poses, alpha = machine.poses(q), q[:, 6]
+    T_TW = machine.scanner.T_TW(alpha)
+    T_HT, n = machine.T_HT, len(q)
+    mount = RigidTransform(
+        R=np.broadcast_to(T_HT.R, (n, 3, 3)), t=np.broadcast_to(T_HT.t, (n, 3)), source=T_HT.source, target=T_HT.target
+    )
+    home = (machine.scanner.T_TW(0.0) @ T_HT).inv
+    R = T_TW.R @ mount.R @ poses.T_MH.R
+    t = np.einsum("nij,nj->ni", T_TW.R, np.einsum("nij,nj->ni", mount.R, poses.T_MH.t) + mount.t) + T_TW.t
+    moved = RigidTransform(R=R @ home.R, t=np.einsum("nij,j->ni", R, home.t) + t, source=T_TW.target, target=T_TW.target)
+    return moved, T_TW
+
+
+def tilted(machine: Machine, alpha: Array, tilt: Array, lift: Array, centre: Array) -> Array:
+    """Axes (n, 7) that tilt the part about y_W by `tilt`, rad, at table angles alpha, lifted by `lift`, mm.
+
+    The plate moves so that the part's middle, `centre` (3,) mm in W at home, stays where it is.  rz keeps to the value
+    of its interval nearest to 0; then everything is drawn to the limits.
+    """
+    home = machine.scanner.T_TW(0.0) @ machine.T_HT
+    T_TW = machine.scanner.T_TW(alpha)
+    axis = np.einsum("nij,j->ni", np.swapaxes(T_TW.R @ machine.T_HT.R, 1, 2), [0.0, 1.0, 0.0])
+    q = np.zeros((len(alpha), 7))
+    q[:, 3:5] = tilt[:, None] * axis[:, :2]
+    q[:, 6] = alpha
+    q = machine.clipped(q)
+    c = home.inv.apply(centre)
+    R = rotation_from_convention(np.degrees(q[:, 3:6]), "pi-hexapod")
+    q[:, :3] = c - R @ c + lift[:, None] * (machine.T_HT.R.T @ [0.0, 0.0, 1.0])
+    return machine.clipped(q)
+
+
+def stations(machine: Machine, part: Part, settings: PartSettings) -> Array:
+    """Axes (n, 7) of all candidates: table angles x tilts about y_W x lifts, within everything that limits them.
+
+    OutOfReachError, naming what blocks, where none is left.
+    """
+    low, high = machine.limits.low, machine.limits.high
+    width = min(high[6] - low[6], FULL_TURN) if np.isfinite(high[6] - low[6]) else FULL_TURN
+    start = low[6] if np.isfinite(low[6]) else 0.0
+    count = max(round(width / settings.alpha_step), 1)
+    turn = np.arange(count) * width / count if machine.turns_freely else np.linspace(0, width, count + 1)
+    reach = CORNER * float(np.abs([low[3:5], high[3:5]]).max())
+    if not np.isfinite(reach):
+        raise InputError("limits: rx_deg and ry_deg need finite travel; without it no tilt is planned")
+    steps = int(np.ceil(reach / settings.tilt_step - 1e-9)) if reach > 0 else 0
+    tilt = np.linspace(-reach, reach, 2 * steps + 1)
+    lift = np.linspace(low[2], high[2], LIFTS) if high[2] - low[2] > 1.0 else np.array([(low[2] + high[2]) / 2])
+    grid = np.stack(np.meshgrid(start + turn, tilt, lift, indexing="ij"), axis=-1).reshape(-1, 3)
+    q = tilted(machine, grid[:, 0], grid[:, 1], grid[:, 2], part.centre)
+    q = q[np.sort(np.unique(np.round(q, 9), axis=0, return_index=True)[1])]
+    good = allowed(machine, part, q, margin=settings.margin)
+    if not good.any():
+        raise OutOfReachError(_what_blocks(machine, part, q, settings), limits=machine.limits)
+    return np.asarray(q[good])
+
+
+def _what_blocks(machine: Machine, part: Part, q: Array, settings: PartSettings) -> str:
+    """Why no candidate is left."""
+    scanner, P = machine.scanner, machine.matrices(q)
+    x_D = project(P, part.hull)
+    size = np.ptp(x_D, axis=1).min(axis=0)
+    free = np.array([scanner.n_u, scanner.n_v]) - 2 * settings.margin
+    if (size > free).any():
+        return (
+            f"{part.name} is larger than the view: its image is at least {size[0]:.0f} x {size[1]:.0f} px, the panel "
+            f"has {free[0]:.0f} x {free[1]:.0f} px inside the margin; move it towards the panel, or turn it on the plate"
+        )
+    seen = in_view(P, part.hull, n_u=scanner.n_u, n_v=scanner.n_v, margin=settings.margin).all(axis=1)
+    if seen.any():
+        names = ", ".join(o.name for o in machine.obstacles)
+        return f"every pose that keeps {part.name} in view hits what must stay clear ({names})"
+    low, high = x_D.min(axis=1), x_D.max(axis=1)
+    side = 0 if (low[:, 0] < settings.margin).mean() + (high[:, 0] > free[0]).mean() > 1 else 1
+    axis = ("y (across the beam)", "z (along the axis)")[side]
+    low_mm, high_mm = machine.limits.low[1 + side], machine.limits.high[1 + side]
+    return (
+        f"no pose within the limits keeps {part.name} in view: it leaves the panel along {axis}, where "
+        f"{AXES[1 + side]} may move from {low_mm:.4g} to {high_mm:.4g} mm; widen the limits or stand the part nearer to "
+        "the middle"
+    )
