@@ -12,5 +12,5 @@ app_plan = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", help="Plan
 
 def register(app: typer.Typer) -> None:
     add_command(app_plan, "poses", plan_poses.poses, epilog=plan_poses.EPILOG)
-    app_plan.command("scan", epilog=plan_scan.EPILOG)(plan_scan.scan)
+    add_command(app_plan, "scan", plan_scan.scan, epilog=plan_scan.EPILOG)
     app.add_typer(app_plan, name="plan")

@@ -1,8 +1,9 @@
-"""Reference meshes from files: STL or PLY in mm, and STEP."""
+"""Meshes from files: STL, PLY or OBJ in mm, and STEP."""
 
 from __future__ import annotations
 
 import struct
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ MEMORY_PER_BYTE = 20
 
 @reader("mesh")
 def read_mesh(path: str | Path) -> Mesh:
-    """A mesh from STL (binary or text), PLY (text or binary little-endian), in mm, or STEP; equal vertices are joined.
+    """A mesh from STL (binary or text), PLY (text or binary little-endian) or OBJ, in mm, or STEP; vertices are joined.
 
     FileError where the file is missing, of another kind or damaged; EngineMissingError for STEP without cascadio.
     """
@@ -26,10 +27,10 @@ def read_mesh(path: str | Path) -> Mesh:
     if path.suffix.lower() in (".step", ".stp"):
         return read_step(path)
     content = read_bytes(path, per_byte=MEMORY_PER_BYTE)
-    parse = {".stl": _read_stl, ".ply": _read_ply}.get(path.suffix.lower())
+    parse = {".stl": _read_stl, ".ply": _read_ply, ".obj": _read_obj}.get(path.suffix.lower())
     if parse is None:
         raise FileError(
-            f"{path}: {path.suffix!r} is no mesh format that is read here; .stl, .ply and .step are", path=path
+            f"{path}: {path.suffix!r} is no mesh format that is read here; .stl, .ply, .obj and .step are", path=path
         )
     with reading(path, "mesh"):  # a mesh's own errors do not name the file
         try:
@@ -55,6 +56,25 @@ def _read_stl(content: bytes) -> Mesh:
     faces = inverse.reshape(-1, 3)
     whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     return Mesh(points=points, faces=faces[whole])
+
+
+def _read_obj(content: bytes) -> Mesh:
+    """Wavefront OBJ: `v x y z` and `f a b c ...`, numbered from 1 or from the end; polygons are cut into fans."""
+    points, faces = [], []
+    for line in content.decode("utf-8", errors="replace").splitlines():
+        words = line.split()
+        if words[:1] == ["v"]:
+            points.append([float(v) for v in words[1:4]])
+        elif words[:1] == ["f"]:
+            number = [int(w.split("/")[0]) for w in words[1:]]
+            corner = [k - 1 if k > 0 else len(points) + k for k in number]
+            faces += [[corner[0], b, c] for b, c in pairwise(corner[1:])]
+    if not faces:
+        raise ValueError("the file holds no faces")
+    unique, inverse = np.unique(np.array(points), axis=0, return_inverse=True)
+    if not 0 <= np.min(faces) <= np.max(faces) < len(points):
+        raise ValueError(f"faces name corners that {len(points)} vertices do not have")
+    return Mesh(points=unique, faces=inverse[np.array(faces)])
 
 
 PLY_TYPES = {

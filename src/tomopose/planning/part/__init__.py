@@ -1,1 +1,1 @@
-"""A scan planned from the part: which views show its features best, within the machine's limits."""
+"""What is planned for: the part, its features, and what views of them are worth."""

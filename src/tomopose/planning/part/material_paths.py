@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import numpy as np
 from numba import njit
@@ -118,8 +119,8 @@ def material_paths(P: Array, points: Array, faces: np.ndarray, x: Array) -> tupl
     P:       (n, 3, 4), |P[2, :3]| = 1, w > 0 at every corner of the mesh.
     points, faces: a closed mesh, (p, 3) mm and (f, 3), counter-clockwise seen from outside.
     x:       (m, 3) mm.
-    L:       length of material on the whole line, mm;  winding: 1 where x lies in the material, 0 outside; anything else
-             says that shells overlap or look inwards.
+    L:       length of material on the whole line, mm;  winding: 1 where x lies in the material, 0 outside; anything
+             else says that shells overlap or look inwards.
     """
     P, points, x = (np.ascontiguousarray(a, dtype=np.float64) for a in (P, points, x))
     faces = np.ascontiguousarray(faces, dtype=np.int32)
@@ -127,6 +128,6 @@ def material_paths(P: Array, points: Array, faces: np.ndarray, x: Array) -> tupl
     workers = min(os.cpu_count() or 1, max(len(P) // 16, 1))
     edges = np.linspace(0, len(P), workers + 1).astype(int)
     with ThreadPoolExecutor(workers) as pool:
-        parts = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        parts = [slice(a, b) for a, b in pairwise(edges)]
         list(pool.map(lambda s: _views(P[s], points, faces, x, L[s], winding[s]), parts))
     return L, winding

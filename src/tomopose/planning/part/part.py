@@ -96,8 +96,8 @@ def require_simple(part: Part) -> None:
     wrong = (np.abs(inside - 1) > 0.5) | (np.abs(outside) > 0.5)
     if wrong.mean() > WRONG_SHARE:
         raise InputError(
-            f"{part.name}: at {100 * wrong.mean():.0f} % of its surface material lies on both sides or on the wrong one: "
-            "shells of the mesh overlap; unite them first"
+            f"{part.name}: at {100 * wrong.mean():.0f} % of its surface material lies on both sides or on the wrong "
+            "one: shells of the mesh overlap; unite them first"
         )
 
 

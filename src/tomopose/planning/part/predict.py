@@ -1,14 +1,17 @@
 """The standard uncertainty of each feature that a set of views lets expect.
 
-A ray that grazes the surface at x_i with incidence g_ij = |n . d| sees a shift delta of the surface along its normal as a
-change mu delta / g_ij of the line integral, whose variance is
+A ray that grazes the surface at x_i with incidence g_ij = |n . d| sees a shift delta along the normal as a change
+mu delta / g_ij of the line integral, whose variance is
+
     var_ij = 1 / (N_0 tau_ij) + (r / (N_0 tau_ij))^2
-(N_0 quanta of an open pixel, readout noise r).  g is not smaller than s_0 = max(sqrt(w / 2 R), w / l): the ray has a width
-w at the object, the surface a radius R or a length l.  A patch of area a is crossed by a g / w^2 independent rays, so that
-    I_i = sum_j (a g_ij / w^2) (mu / g_ij)^2 / var_ij
-is the information on the position of the surface there, and A = sum_i I_i J_i J_i^T that on the feature's parameters.
-It is a Cramer-Rao bound with all else known, hence optimistic; ratios between sets of views are what it is good for.
-Cramer 1946; the sensitivity of a grazing ray is that of a straight edge in a parallel beam.
+
+with N_0 quanta of an open pixel and readout noise r.  g is at least s_0 = max(sqrt(w / 2 R), w / l): the ray has a
+width w at the object, the surface a radius R or a length l.  A patch of area a is crossed by a g / w^2 independent
+rays, so that the information on the position of the surface there, and that on the feature's parameters, are
+
+    I_i = sum_j (a g_ij / w^2) (mu / g_ij)^2 / var_ij        A = sum_i I_i J_i J_i^T
+
+This is a Cramer-Rao bound with all else known, hence optimistic; ratios between sets of views are what it is good for.
 """
 
 from __future__ import annotations
@@ -140,6 +143,6 @@ def why_unseen(goal: Goal, P: Array, views: Views, target: Target) -> str:
     turn /= max(float(np.linalg.norm(turn)), 1e-12)
     return (
         f"no ray comes nearer to its tangent plane than {least.max():.3g} deg: tilt the fixture by "
-        f"{max(least.max() - np.degrees(s.tangent), 0.0):.3g} deg about ({turn[0]:.2f}, {turn[1]:.2f}, {turn[2]:.2f}), or "
-        "allow more tilt"
+        f"{max(least.max() - np.degrees(s.tangent), 0.0):.3g} deg about ({turn[0]:.2f}, {turn[1]:.2f}, {turn[2]:.2f}), "
+        "or allow more tilt"
     )

@@ -1,8 +1,8 @@
 """The numbers that define what a set of views is worth, with their defaults.
 
-Measured on a plate with bores, planned on other points than judged: attenuation wrong by a factor of 0.67 to 2 costs 4 %
-of J, the tolerance of a tangent 1.0 deg in place of 1.5 deg 10 %, 2 to 2.5 deg 1 to 2 %, another soft width 1 %, other
-weights up to 1 %.
+Measured on a plate with bores, planned on other points than judged: attenuation wrong by a factor of 0.67 to 2 costs 4
+% of J, the tolerance of a tangent 1.0 deg in place of 1.5 deg 10 %, 2 to 2.5 deg 1 to 2 %, another soft width 1 %,
+other weights up to 1 %.
 """
 
 from __future__ import annotations

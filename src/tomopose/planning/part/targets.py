@@ -1,4 +1,4 @@
-"""What the scan is for: points with normals on the features of the part, and the points and planes of Tuy's condition."""
+"""What the scan is for: points with normals on the part's features, and points and planes of Tuy's condition."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ INWARD = (0.3, 0.1, 0.03, 0.0)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Target:
-    """A feature: points x (m, 3), mm in W at home, unit normals n (m, 3) from material to air, area of each point, mm^2.
+    """A feature: points x (m, 3), mm in W at home, unit normals n (m, 3) from material to air, area of each point,
+    mm^2.
 
     shape: of a sphere, circle, cylinder or cone;  radius: of the surface's curvature, mm, inf for planes;
     length: along which a flat face extends, mm.

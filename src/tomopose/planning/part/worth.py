@@ -100,7 +100,7 @@ class Worth:
 
 def sources(P: Array) -> Array:
     """(n, 3) where the source is in coordinates of the part, mm."""
-    return -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[..., 0]
+    return np.asarray(-np.linalg.solve(P[:, :, :3], P[:, :, 3:])[..., 0], dtype=np.float64)
 
 
 def table(goal: Goal, P: Array) -> Views:

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from tomopose.planning.part.choose import without_each
 from tomopose.planning.part.settings import WEIGHTS
-from tomopose.planning.part.stations import Machine, allowed
 from tomopose.planning.part.worth import Goal, Views, table
+from tomopose.planning.part_scan.choose import without_each
+from tomopose.planning.part_scan.stations import Machine, allowed
 from tomopose.units import Array
 
 ROUNDS = 2
@@ -20,7 +20,7 @@ LIFT_STEP_MM = 2.0
 
 def refine_off_grid(goal: Goal, machine: Machine, q: Array, views: Views) -> tuple[Array, Views]:
     """(q (n, 7), their tables): no view worth less for J than before, all within limits, in view and clear."""
-    q, w, m, n = q.copy(), goal.w, len(goal.x), len(q)
+    q, w, n = q.copy(), goal.w, len(q)
     A, tau, incidence = (np.array(a) for a in (views.A, views.tau, views.incidence))
     s = goal.settings
     full = np.array([s.alpha_step, s.tilt_step, s.tilt_step, LIFT_STEP_MM])
@@ -33,12 +33,11 @@ def refine_off_grid(goal: Goal, machine: Machine, q: Array, views: Views) -> tup
             if not len(around):
                 continue
             tried = table(goal, machine.matrices(around))
-            gains = [float(w @ np.maximum(a - base, 0)) + WEIGHTS[2] * M / n for a, M in zip(tried.A, tried.M, strict=True)]
-            own = float(w @ np.maximum(A[i] - base, 0)) + WEIGHTS[2] * float(tau[i].mean()) / n
+            gains = np.maximum(tried.A - base, 0) @ w + WEIGHTS[2] * tried.M / n
+            own = float(np.maximum(A[i] - base, 0) @ w) + WEIGHTS[2] * float(tau[i].mean()) / n
             k = int(np.argmax(gains))
             if gains[k] > own + 1e-9:
                 q[i], A[i], tau[i], incidence[i] = around[k], tried.A[k], tried.tau[k], tried.incidence[k]
-    assert A.shape[1] == m + len(goal.x_tuy) * len(goal.planes)
     return q, Views(A=A, tau=tau, incidence=incidence)
 
 

@@ -1,11 +1,11 @@
 """limits.toml: what the machine may do, and what the part must stay clear of.
 
-    [travel]
-    x_mm = [-10, 10]            # y_mm, z_mm, rx_deg, ry_deg, rz_deg, alpha_deg
-    [time]
-    speed_mm_s = 2              # speed_deg_s, settle_s, image_s, limit_s
-    [keep_out]
-    tube = {file = "tube.stl", frame = "W"}
+[travel]
+x_mm = [-10, 10]            # y_mm, z_mm, rx_deg, ry_deg, rz_deg, alpha_deg
+[time]
+speed_mm_s = 2              # speed_deg_s, settle_s, image_s, limit_s
+[keep_out]
+tube = {file = "tube.stl", frame = "W"}
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from tomopose.errors import FileError, InputError
 from tomopose.measurement.mesh.mesh_files import read_mesh
-from tomopose.planning.part.keep_out import Obstacle
+from tomopose.planning.part_scan.keep_out import Obstacle
 from tomopose.reading import parse_toml, read_text, reader
 from tomopose.trajectory.feasibility import TravelLimits
 
@@ -30,7 +30,8 @@ DEFAULT_MM, DEFAULT_DEG = 10.0, 5.0
 
 @dataclass(frozen=True, kw_only=True)
 class MoveTime:
-    """speed: mm/s and speed_deg: deg/s of every axis;  settle: s after a move;  image: s an image;  limit: s for all."""
+    """speed: mm/s and speed_deg: deg/s of every axis;  settle: s after a move;  image: s an image;  limit: s for
+    all."""
 
     speed: float = 2.0
     speed_deg: float = 5.0
@@ -69,7 +70,9 @@ def _interval(name: str, given: object) -> tuple[float, float]:
     if math.isnan(low) or math.isnan(high):
         raise InputError(f"limits: {name} is {given!r}, which is not a number")
     if low > high:
-        raise InputError(f"limits: {name} contradicts itself: its lower limit {low:g} is above its upper limit {high:g}")
+        raise InputError(
+            f"limits: {name} contradicts itself: its lower limit {low:g} is above its upper limit {high:g}"
+        )
     return low, high
 
 

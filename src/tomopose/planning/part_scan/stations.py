@@ -12,9 +12,9 @@ from tomopose.geometry.rotations import rotation_from_convention
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.planning.part.keep_out import Obstacle, hits
 from tomopose.planning.part.part import Part
 from tomopose.planning.part.settings import PartSettings
+from tomopose.planning.part_scan.keep_out import Obstacle, hits
 from tomopose.trajectory.feasibility import AXES, TravelLimits, in_view
 from tomopose.units import Array
 
@@ -93,8 +93,8 @@ def _motions(machine: Machine, q: Array) -> tuple[RigidTransform, RigidTransform
     home = (machine.scanner.T_TW(0.0) @ T_HT).inv
     R = T_TW.R @ mount.R @ poses.T_MH.R
     t = np.einsum("nij,nj->ni", T_TW.R, np.einsum("nij,nj->ni", mount.R, poses.T_MH.t) + mount.t) + T_TW.t
-    moved = RigidTransform(R=R @ home.R, t=np.einsum("nij,j->ni", R, home.t) + t, source=T_TW.target, target=T_TW.target)
-    return moved, T_TW
+    W = T_TW.target
+    return RigidTransform(R=R @ home.R, t=np.einsum("nij,j->ni", R, home.t) + t, source=W, target=W), T_TW
 
 
 def tilted(machine: Machine, alpha: Array, tilt: Array, lift: Array, centre: Array) -> Array:
@@ -149,8 +149,8 @@ def _what_blocks(machine: Machine, part: Part, q: Array, settings: PartSettings)
     free = np.array([scanner.n_u, scanner.n_v]) - 2 * settings.margin
     if (size > free).any():
         return (
-            f"{part.name} is larger than the view: its image is at least {size[0]:.0f} x {size[1]:.0f} px, the panel "
-            f"has {free[0]:.0f} x {free[1]:.0f} px inside the margin; move it towards the panel, or turn it on the plate"
+            f"{part.name} is larger than the view: its image is at least {size[0]:.0f} x {size[1]:.0f} px, the "
+            f"panel has {free[0]:.0f} x {free[1]:.0f} px inside the margin; move it nearer to the panel, or turn it"
         )
     seen = in_view(P, part.hull, n_u=scanner.n_u, n_v=scanner.n_v, margin=settings.margin).all(axis=1)
     if seen.any():
@@ -162,6 +162,6 @@ def _what_blocks(machine: Machine, part: Part, q: Array, settings: PartSettings)
     low_mm, high_mm = machine.limits.low[1 + side], machine.limits.high[1 + side]
     return (
         f"no pose within the limits keeps {part.name} in view: it leaves the panel along {axis}, where "
-        f"{AXES[1 + side]} may move from {low_mm:.4g} to {high_mm:.4g} mm; widen the limits or stand the part nearer to "
-        "the middle"
+        f"{AXES[1 + side]} may move from {low_mm:.4g} to {high_mm:.4g} mm; widen the limits, or stand the part "
+        "nearer to the middle"
     )

@@ -1,4 +1,4 @@
-"""The usual paths with as many views and within the same limits: circular, triangle (eq. 11) and sine (paper sec. 6.1)."""
+"""The usual paths with as many views and within the same limits: circular, triangle (eq. 11) and sine (sec. 6.1)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from functools import partial
 import numpy as np
 
 from tomopose.geometry.rotations import convention_from_rotation
-from tomopose.planning.part.stations import FULL_TURN, Machine
+from tomopose.planning.part_scan.stations import FULL_TURN, Machine
+from tomopose.trajectory.feasibility import TOLERANCE
 from tomopose.trajectory.tilt import eq10_rotation, sine_wave, triangle_wave
 from tomopose.units import Array
 
@@ -43,8 +44,8 @@ def _largest(machine: Machine, N: int, wave: Callable[[Array, float], Array]) ->
         return q
 
     def inside(q: Array) -> bool:
-        slack = 1e-9
-        return bool(((q[:, :6] >= machine.limits.low[:6] - slack) & (q[:, :6] <= machine.limits.high[:6] + slack)).all())
+        low, high = machine.limits.low[:6] - TOLERANCE, machine.limits.high[:6] + TOLERANCE
+        return bool(((q[:, :6] >= low) & (q[:, :6] <= high)).all())
 
     fits, fails = 0.0, 1.0
     if inside(axes(1.0)):

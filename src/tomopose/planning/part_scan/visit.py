@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from tomopose.planning.order import short_tour
-from tomopose.planning.part.limits_file import MoveTime
-from tomopose.planning.part.stations import Machine
+from tomopose.planning.part_scan.limits_file import MoveTime
+from tomopose.planning.part_scan.stations import Machine
 from tomopose.units import Array
 
 HALF_TURN = np.pi
@@ -33,7 +33,7 @@ def duration(machine: Machine, time: MoveTime, q: Array) -> float:
     return float((d / speeds).max(axis=1).sum() + len(d) * time.settle + len(q) * time.image)
 
 
-def visiting_order(machine: Machine, q: Array) -> Array:
+def visiting_order(machine: Machine, q: Array) -> np.ndarray:
     """(n,) rows of q (n, 7) in a short order that begins nearest to where the machine stands: zero, or its limits.
 
     Nearest neighbour, then 2-opt, on a path that need not return; never longer than the order given.

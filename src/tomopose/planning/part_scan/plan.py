@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from tomopose.calibration.projection_matrices import projection_matrices
-from tomopose.calibration.result import Calibration
 from tomopose.errors import InputError
-from tomopose.geometry.scanner import Scanner
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.measurement.plan import MeasurementPlan
-from tomopose.planning.design import nominal_mount
-from tomopose.planning.part.choose import choose, dual_bound, value
-from tomopose.planning.part.limits_file import ScanLimits
-from tomopose.planning.part.off_grid import refine_off_grid
-from tomopose.planning.part.part import Part
-from tomopose.planning.part.paths import usual_paths
 from tomopose.planning.part.predict import Predicted, measurand_u, predicted, shared_part, why_unseen
 from tomopose.planning.part.settings import WEIGHTS, PartSettings
-from tomopose.planning.part.stations import Machine, allowed, stations
-from tomopose.planning.part.targets import plane_normals, targets_of, tuy_points
-from tomopose.planning.part.visit import duration, travel, visiting_order
-from tomopose.planning.part.worth import Goal, Views, Worth, table, worth
+from tomopose.planning.part.worth import Goal, Views, Worth, sources, table, worth
+from tomopose.planning.part_scan.choose import choose, dual_bound, value
+from tomopose.planning.part_scan.limits_file import ScanLimits
+from tomopose.planning.part_scan.off_grid import refine_off_grid
+from tomopose.planning.part_scan.paths import usual_paths
+from tomopose.planning.part_scan.setting import Setting
+from tomopose.planning.part_scan.stations import Machine, allowed, stations
+from tomopose.planning.part_scan.visit import duration, travel, visiting_order
 from tomopose.units import Array
 
 Progress = Callable[[str], None]
@@ -72,79 +67,52 @@ class PartScanPlan:
     goal: Goal
     settings: PartSettings
     machine: Machine
+    limits: ScanLimits
     dropped: tuple[int, float]
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    @property
+    def source_path(self) -> Array:
+        """(n, 3) where the source is in the part's coordinates, mm, in the order of the views."""
+        return sources(self.machine.matrices(self.chosen.q))
 
 
 def _silent(_: str) -> None:
     return None
 
 
-def plan_part_scan(
-    scanner: Scanner,
-    part: Part,
-    views: int,
-    settings: PartSettings,
-    *,
-    features: MeasurementPlan | None = None,
-    limits: ScanLimits | None = None,
-    calibration: Calibration | None = None,
-    progress: Progress = _silent,
-) -> PartScanPlan:
-    """Choose `views` views of a part within the machine's limits.
+def plan_part_scan(setting: Setting, *, progress: Progress = _silent) -> PartScanPlan:
+    """Choose views of a part within the machine's limits.
 
-    Parameters
-    ----------
-    scanner, part: the part lies in W at home, mm.
-    settings:      the part's attenuation and the definition of J.
-    features:      a measurement plan; without it the whole surface counts, by area.
-    limits:        travel, times, obstacles; without them +-10 mm, +-5 deg and a table that turns freely.
-    calibration:   the mount, pivot and shared uncertainty; without it the paper's mount, R_z(180 deg).
+    setting: what is wanted;  progress: is given a line before each stage.
 
     Raises
     ------
     OutOfReachError  no candidate keeps the whole part in view and clear;  InputError  features off the part, or fewer
     candidates than views.
     """
-    limits = ScanLimits() if limits is None else limits
-    machine = Machine(
-        scanner=scanner,
-        T_HT=nominal_mount() if calibration is None else calibration.T_HT,
-        limits=limits.travel,
-        obstacles=limits.obstacles,
-        pivot=None if calibration is None else calibration.pivot,
-    )
-    goal = _goal(part, features, settings)
+    machine, goal, views = setting.machine, setting.goal(), setting.views
     progress("candidates within the limits, in view and clear")
-    q_all = stations(machine, part, settings)
+    q_all = stations(machine, setting.part, setting.settings)
     if len(q_all) < views:
         raise InputError(
-            f"{views} views are wanted and only {len(q_all)} candidates are allowed; widen the limits, or ask for fewer "
-            "views"
+            f"{views} views are wanted and only {len(q_all)} candidates are allowed; widen the limits, or ask for "
+            "fewer views"
         )
     progress(f"transmission of {len(q_all)} candidates at {len(goal.x) + len(goal.x_tuy)} points")
     tables = table(goal, machine.matrices(q_all))
     progress(f"choosing {views} of {len(q_all)}")
-    m, w = WEIGHTS[2] * tables.M / views, goal.w
-    rows = choose(tables.A, m, w, views)
+    m = WEIGHTS[2] * tables.M / views
+    rows = choose(tables.A, m, goal.w, views)
     progress("moving the chosen views off the grid")
     q, fine = refine_off_grid(goal, machine, q_all[rows], tables.take(rows))
     progress("bounding what any choice could reach")
-    A = np.concatenate([tables.A, fine.A])
-    m = np.concatenate([m, WEIGHTS[2] * fine.M / views])
-    reached = value(A, m, w, len(q_all) + np.arange(views))
-    bound = dual_bound(A, m, w, views, prices=fine.A.max(axis=0), reached=reached)
-    q, dropped = _within_time(machine, limits, goal, q, fine)
+    reached, bound = _certificate(goal, tables, fine, views)
+    q, dropped = _within_time(machine, setting.limits, goal, q, fine)
     progress("judging the plan and the usual paths on other points")
-    judge = _Judge(
-        goal=_goal(part, features, settings, judged=True),
-        machine=machine,
-        limits=limits,
-        calibration=calibration,
-        features=features,
-    )
+    judge = _Judge(goal=setting.goal(judged=True), machine=machine, setting=setting)
     return PartScanPlan(
         poses=machine.poses(q),
         planned_J=reached,
@@ -155,15 +123,19 @@ def plan_part_scan(
         unseen=_unseen(goal, machine, q_all, tables),
         seen=(table(judge.goal, machine.matrices(q)).A[:, : len(judge.goal.x)] > 0).sum(axis=0),
         goal=judge.goal,
-        settings=settings,
+        settings=setting.settings,
         machine=machine,
+        limits=setting.limits,
         dropped=dropped,
     )
 
 
-def _goal(part: Part, features: MeasurementPlan | None, settings: PartSettings, *, judged: bool = False) -> Goal:
-    targets = targets_of(part, features, judged=judged, seed=settings.seed)
-    return Goal(part=part, targets=targets, x_tuy=tuy_points(part, targets), planes=plane_normals(), settings=settings)
+def _certificate(goal: Goal, tables: Views, fine: Views, views: int) -> tuple[float, float]:
+    """(J of the chosen views, bound on J of as many of the candidates and the chosen views)."""
+    A = np.concatenate([tables.A, fine.A])
+    m = WEIGHTS[2] * np.concatenate([tables.M, fine.M]) / views
+    reached = value(A, m, goal.w, len(tables.A) + np.arange(views))
+    return reached, dual_bound(A, m, goal.w, views, prices=fine.A.max(axis=0), reached=reached)
 
 
 def _within_time(
@@ -203,17 +175,15 @@ def _unseen(goal: Goal, machine: Machine, q: Array, tables: Views) -> dict[str, 
 class _Judge:
     goal: Goal
     machine: Machine
-    limits: ScanLimits
-    calibration: Calibration | None
-    features: MeasurementPlan | None
+    setting: Setting
 
     def __call__(self, q: Array) -> Judged:
         P, goal = self.machine.matrices(q), self.goal
         views = table(goal, P)
         shared = None
-        if self.calibration is not None:
+        if self.setting.calibration is not None:
             x = np.array([t.x.mean(axis=0) for t in goal.targets])
-            sigma = projection_matrices(self.calibration, self.machine.poses(q), points=x).points_sigma_shared
+            sigma = projection_matrices(self.setting.calibration, self.machine.poses(q), points=x).points_sigma_shared
             assert sigma is not None
             shared = shared_part(goal, self.machine.scanner, P, np.asarray(sigma).reshape(-1, len(x)).mean(axis=0))
         found = tuple(predicted(goal, self.machine.scanner, P, views, shared=shared))
@@ -221,14 +191,9 @@ class _Judge:
             q=q,
             worth=worth(goal, P, views),
             features=found,
-            lengths={} if self.features is None else measurand_u(self.features.measurands, found),
+            lengths={} if self.setting.features is None else measurand_u(self.setting.features.measurands, found),
             travel=travel(self.machine, q),
-            duration=duration(self.machine, self.limits.time, q),
+            duration=duration(self.machine, self.setting.limits.time, q),
             tau=views.M,
             out_of_view=int((~allowed(self.machine, goal.part, q, margin=0.0)).sum()),
         )
-
-
-def with_attenuation(settings: PartSettings, mu: float) -> PartSettings:
-    """The settings for another attenuation coefficient, 1/mm."""
-    return replace(settings, mu=mu)

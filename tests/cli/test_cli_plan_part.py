@@ -1,0 +1,124 @@
+"""`tomopose plan scan --part`: files that agree with one another, and bad input that leaves nothing behind."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tomopose as tp
+from tomopose.cli.main import run
+from tomopose.io.foreign.reading import read_pose_log
+
+SCANNER = tp.Scanner(
+    d_SD=1000.0,
+    d_SR=400.0,
+    p_u=0.8,
+    p_v=0.75,
+    u_0=66.3,
+    v_0=61.1,
+    n_u=131,
+    n_v=127,
+    sigma={"d_SR": 0.05, "u_0": 0.2},
+)
+LIMITS = """
+[travel]
+z_mm = [0, 0.5]
+rx_deg = [-8, 8]
+ry_deg = [-8, 8]
+rz_deg = [0, 0]
+alpha_deg = [0, 45]
+"""
+
+
+def write_box(path: Path, half: tuple[float, float, float]) -> None:
+    """An OBJ of six quadrilaterals, faces counter-clockwise from outside."""
+    corners = np.array(list(itertools.product((-1, 1), repeat=3))) * half
+    quads = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
+    lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {a} {b} {c} {d}" for a, b, c, d in quads]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+@pytest.fixture
+def words(tmp_path) -> list[str]:
+    write_box(tmp_path / "part.obj", (9.0, 7.0, 2.5))
+    tp.write_scanner(tmp_path / "scanner.json", SCANNER)
+    (tmp_path / "limits.toml").write_text(LIMITS)
+    files = {"part": "part.obj", "scanner": "scanner.json", "limits": "limits.toml", "out": "scan.csv"}
+    return ["plan", "scan", *itertools.chain(*((f"--{k}", str(tmp_path / v)) for k, v in files.items()))]
+
+
+def test_a_planned_scan_comes_with_its_figures_its_page_and_the_machine_list(words, tmp_path, capsys):
+    assert run([*words, "--mu-per-mm", "0.05", "--views", "9", "--commands", "pi-gcs", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    document = json.loads((tmp_path / "scan.json").read_text())
+    assert document["schema"] == "tomopose/scan-plan/1"
+    assert said["J"] == document["J"]
+    assert 0 < document["J"] <= document["bound"] <= 1
+    assert document["J"] == pytest.approx(0.5 * document["C"] + 0.3 * document["T"] + 0.2 * document["M"])
+    assert set(document["paths"]) == {"circular", "triangle", "sine"}
+    assert document["constants"]["tangent_deg"] == pytest.approx(1.5)
+    assert "y_mm" in document["assumed_limits"]
+    poses = tp.read_poses(tmp_path / "scan.csv")
+    assert len(poses) == 9
+    tilts = np.degrees(poses.T_MH.angles)
+    assert np.abs(tilts).max() <= 8 + 1e-9
+    np.testing.assert_allclose(tilts[:, 2], 0, atol=1e-9)
+    html = (tmp_path / "scan.html").read_text()
+    assert "Beside the usual paths" in html
+    assert "http://" not in html.split("</script>")[-1]
+    back = read_pose_log(tmp_path / "scan.gcs").poses()
+    np.testing.assert_allclose(back.T_MH.t, poses.T_MH.t, atol=1e-6)
+
+
+def test_a_material_is_looked_up_and_the_assumed_voltage_is_said(words, tmp_path, capsys):
+    assert run([*words, "--material", "Al", "--views", "4"]) == 0
+    out = capsys.readouterr().out
+    assert "150 kV (assumed: --kv was not given)" in out
+    mu = json.loads((tmp_path / "scan.json").read_text())["constants"]["mu_per_mm"]
+    assert 0.03 < mu < 0.2
+
+
+def test_a_placing_is_stated_and_never_worse_than_as_given(words, tmp_path):
+    assert run([*words, "--mu-per-mm", "0.05", "--views", "4", "--placing", "--quiet"]) == 0
+    placing = json.loads((tmp_path / "scan.json").read_text())["placing"]
+    tried = {t["rotation"]: t["J"] for t in placing["tried"]}
+    assert max(tried.values()) >= tried["as given"] > 0
+    R = np.array(placing["R"])
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "match"),
+    [
+        (["--views", "100000", "--mu-per-mm", "0.05"], 1, "candidates"),
+        (["--mu-per-mm", "-1"], 1, "mu"),
+        (["--mu-per-mm", "nan"], 1, "mu"),
+        (["--mu-per-mm", "0.05", "--material", "Al"], 2, "give one"),
+        ([], 2, "attenuation"),
+        (["--shape", "circular", "--mu-per-mm", "0.05"], 2, "--part"),
+        (["--mu-per-mm", "0.05", "--commands", "siemens"], 2, "siemens"),
+        (["--material", "unobtainium"], 1, "unobtainium"),
+    ],
+)
+def test_bad_input_is_answered_in_words_and_leaves_nothing(words, tmp_path, capsys, change, code, match):
+    assert run([*words, *change]) == code
+    assert match in capsys.readouterr().err
+    assert not list(tmp_path.glob("scan.*"))
+
+
+def test_an_open_part_is_refused(words, tmp_path, capsys):
+    path = tmp_path / "part.obj"
+    path.write_text("\n".join(path.read_text().splitlines()[:-1]))
+    assert run([*words, "--mu-per-mm", "0.05"]) == 1
+    assert "open" in capsys.readouterr().err
+
+
+def test_files_that_exist_are_kept(words, tmp_path, capsys):
+    (tmp_path / "scan.html").write_text("mine")
+    assert run([*words, "--mu-per-mm", "0.05"]) == 1
+    assert (tmp_path / "scan.html").read_text() == "mine"
+    assert not (tmp_path / "scan.csv").exists()
