@@ -81,7 +81,12 @@ def test_the_first_screen_says_what_the_uncertainty_is_made_of_and_what_would_he
 def test_sigma_zero_is_exact_and_silence_is_not():
     poses = paper_poses()
     exact, silent = (tp.calibrate(s, poses, observe(poses)) for s in (SCANNER, SILENT))
-    assert {a.source for a in exact.assumed} == {"exact"}
+    scatter = {"scatter_and_backlash_t", "scatter_and_backlash_w"}
+    assert {a.source for a in exact.assumed if a.name not in scatter} == {"exact"}
+    assert {a.name: (a.sigma, a.source) for a in exact.assumed if a.name in scatter} == {
+        "scatter_and_backlash_t": (5e-4, "default"),
+        "scatter_and_backlash_w": (12e-6, "default"),
+    }
     u = {name: {p.name: p.u for p in cal.parameters}["t_HT_x"] for name, cal in (("exact", exact), ("silent", silent))}
     assert u["silent"] > 20 * u["exact"]
 

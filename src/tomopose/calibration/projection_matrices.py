@@ -12,6 +12,7 @@ from tomopose.calibration.uncertainty.trajectory import scatter_variance, shared
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
+from tomopose.geometry.rotations import rotation_angle_between
 from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.error_models import corrected_poses
@@ -19,6 +20,7 @@ from tomopose.manipulator.poses import PIVOT_TOLERANCE_MM, PoseSequence
 from tomopose.units import Array
 
 SCANNER_TOLERANCE = 1e-9
+STILL_MM, STILL_RAD = 1e-6, 1e-9
 
 
 def _require_same_pivot(calibration: Calibration, poses: PoseSequence) -> None:
@@ -30,6 +32,17 @@ def _require_same_pivot(calibration: Calibration, poses: PoseSequence) -> None:
             f"the scan's pivot {np.asarray(poses.pivot)} mm is not the calibration's {calibration.pivot} mm (off by "
             f"{off:.6g} mm): a scan about another pivot would be wrong by (1 - R) times that; set the calibration's "
             "pivot or calibrate again"
+        )
+
+
+def _require_what_was_calibrated(calibration: Calibration, poses: PoseSequence) -> None:
+    if calibration.arrangement != "turntable":
+        return
+    T = poses.T_MH
+    if rotation_angle_between(T.R[0], T.R).max() > STILL_RAD or np.abs(T.t - T.t[0]).max() > STILL_MM:
+        raise InputError(
+            "the calibration is one of a turning table alone, which says nothing of the manipulator: its mount is "
+            "unknown; calibrate with poses that move before a scan that does"
         )
 
 
@@ -95,6 +108,7 @@ def projection_matrices(
     InputError  another pivot or scanner than the calibration's.
     """
     _require_same_pivot(calibration, poses)
+    _require_what_was_calibrated(calibration, poses)
     if scanner is not None:
         require_same_scanner(calibration, scanner)
     commanded = poses

@@ -25,8 +25,9 @@ from tomopose.manipulator.error_models import Errors, RigidErrors
 from tomopose.provenance import Provenance
 from tomopose.units import Array, float_array
 
-Arrangement: TypeAlias = Literal["moving-object", "moving-scanner", "twin"]
+Arrangement: TypeAlias = Literal["moving-object", "moving-scanner", "twin", "turntable"]
 ARRANGEMENTS: tuple[Arrangement, ...] = get_args(Arrangement)
+SCANNER_MOVES: tuple[Arrangement, ...] = ("moving-scanner", "twin")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,7 +200,7 @@ class Calibration:
     @property
     def inverse(self) -> bool:
         """Whether source and detector move, so that pose tables enter inverted."""
-        return self.arrangement != "moving-object"
+        return self.arrangement in SCANNER_MOVES
 
     @property
     def t(self) -> Array:

@@ -14,7 +14,7 @@ from tomopose.calibration.checks.convention_tests import Diagnosis, ranked, set_
 from tomopose.calibration.checks.conventions import ALTERNATIVES
 from tomopose.calibration.checks.placement import require_on_panel
 from tomopose.calibration.checks.scanner_tests import ScannerTests, rows_to_test, scanner_tests
-from tomopose.calibration.model.assumed import Assumed, taken_as_known, without_effect
+from tomopose.calibration.model.assumed import Assumed, scatter_assumed, taken_as_known, without_effect
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS
 from tomopose.calibration.model.covariance import inverse_information, widening
 from tomopose.calibration.model.linear_fit import LinearFit
@@ -28,9 +28,9 @@ from tomopose.calibration.model.parameters import (
     translation_scale,
 )
 from tomopose.calibration.model.problem import Problem, pair
-from tomopose.calibration.model.unseen import Unseen, unseen_columns, unseen_gain, unseen_names
+from tomopose.calibration.model.unseen import Unseen, unseen_of
 from tomopose.calibration.result import Arrangement, Calibration, PoseNoiseFound
-from tomopose.calibration.rigid.contradiction import NOTHING_FITS, Contradicted, contradicted
+from tomopose.calibration.rigid.contradiction import NOTHING_FITS, Contradicted, as_stated, contradicted
 from tomopose.calibration.rigid.estimate import Solution, solve, with_pose_noise
 from tomopose.calibration.rigid.fit import blocks, linear_fit
 from tomopose.calibration.rigid.observability import observability
@@ -167,15 +167,19 @@ FEWEST_TESTED = 10
 """Equations beyond the unknowns that the tests need."""
 
 
-def _unseen(solution: Solution, linear: LinearFit, *, moving_scanner: bool) -> Unseen | None:
+def _unseen(solution: Solution, linear: LinearFit, *, moving_scanner: bool) -> Unseen:
     """What no ball shows of table and manipulator, and how the estimate answers to it."""
     p, fit = solution.used, solution.fit
-    names = () if moving_scanner else unseen_names(p.R_MH, table=True)
-    if not names:
-        return None
-    b = blocks(p, solution.free, fit)
-    C = unseen_columns(names, b, T_HT=fit.T_HT, origin=p.t_MH, alpha=p.alpha)
-    return unseen_gain(names, inverse_information(fit.N), linear.J, linear.C, C)
+    return unseen_of(
+        blocks(p, solution.free, fit),
+        inverse_information(fit.N),
+        linear.J,
+        linear.C,
+        T_HT=fit.T_HT,
+        origin=p.t_MH,
+        alpha=p.alpha,
+        moving_scanner=moving_scanner,
+    )
 
 
 def calibrate(
@@ -258,18 +262,18 @@ def calibrate(
         return rigid
     from tomopose.calibration.identified.calibrate import calibrate_kinematic
 
-    found = calibrate_kinematic(
+    return calibrate_kinematic(
         scanner,
         poses,
         observations,
         manipulator=manipulator,
         model=model,
         rigid=rigid,
-        free=freed,
+        free=as_stated(freed, rigid.contradicted),
+        auto=auto,
         distances=distances,
         robust=robust,
     )
-    return replace(found, assumed=rigid.assumed, contradicted=rigid.contradicted)
 
 
 def freed_names(free: str | Sequence[str]) -> tuple[tuple[str, ...], bool]:
@@ -291,6 +295,16 @@ def maker_of(manipulator: Any, stated: Repeatability | None) -> Repeatability | 
 
     machine = machine_of(manipulator)
     return None if machine is None else machine.repeatability
+
+
+def _scatter_assumed(pose_noise: str | tuple[float, float] | None, maker: Repeatability | None) -> tuple[Assumed, ...]:
+    """What was assumed of the poses' scatter: the maker's repeatability, or a number that was given."""
+    if pose_noise is None:
+        return scatter_assumed(0.0, 0.0, "exact")
+    if not isinstance(pose_noise, str):
+        return scatter_assumed(float(pose_noise[0]), float(pose_noise[1]), "option")
+    prior = Repeatability() if maker is None else maker
+    return scatter_assumed(prior.t_mm, prior.w_rad, "default" if maker is None else "option")
 
 
 def _by_assumed(
@@ -350,7 +364,7 @@ def rigid_calibration(
         "robust": robust,
         "pose_noise": pose_noise if pose_noise is None or isinstance(pose_noise, str) else list(pose_noise),
     }
-    taken = Taken(assumed=assumed, contradicted=against)
+    taken = Taken(assumed=(*assumed, *_scatter_assumed(pose_noise, maker)), contradicted=against)
     found = _rigid(solution, stated, diagnosis, arrangement, arguments, taken)
     found = replace(found, scanner=replace(found.scanner, sigma=plain.scanner.sigma))
     if not found.converged and raise_on_failure:

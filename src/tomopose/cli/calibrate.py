@@ -23,9 +23,12 @@ EPILOG = (
     "C-arm: tomopose calibrate --arrangement moving-scanner --manipulator robot.json --scanner scanner.json --poses "
     "poses.csv --observations observations.csv --out cal/\n\n"
     "Twin robots: tomopose calibrate --twin twin.json --poses detector.csv --source-poses source.csv --scanner "
-    "scanner.json --observations observations.csv --out cal/"
+    "scanner.json --observations observations.csv --out cal/\n\n"
+    "A table that turns alone: tomopose calibrate --arrangement turntable --scanner scanner.json --poses poses.csv "
+    "--observations observations.csv --out cal/"
 )
-ARRANGEMENTS = ("moving-object", "moving-scanner")
+ARRANGEMENTS = ("moving-object", "moving-scanner", "turntable")
+METHODS = ("poses", "turntable")
 
 SCALE_BAR = re.compile(r"(?P<a>\d+),(?P<b>\d+)=(?P<mm>\d+\.?\d*)\((?P<u>\d*\.?\d+)\)")
 
@@ -81,9 +84,18 @@ class CalibrationOptions(ObservedOptions, SpokenOptions):
         typer.Option(
             "--arrangement",
             help="What the manipulator carries: moving-object, or moving-scanner (source "
-            "and detector; C-arm, gantry), where the ball does not move.",
+            "and detector; C-arm, gantry), where the ball does not move; turntable: nothing moves but the table.",
         ),
     ] = "moving-object"
+    method: Annotated[
+        str, typer.Option("--method", help="poses, or turntable: the same as --arrangement turntable.")
+    ] = "poses"
+    from_pose: Annotated[
+        str | None, typer.Option("--from-pose", help="Use the poses of the table from this pose_id on.")
+    ] = None
+    until_pose: Annotated[
+        str | None, typer.Option("--until-pose", help="Use the poses before this pose_id, which is left out.")
+    ] = None
     distance_sigma: Annotated[
         float,
         typer.Option(
@@ -104,6 +116,10 @@ class CalibrationOptions(ObservedOptions, SpokenOptions):
     @property
     def moving_scanner(self) -> bool:
         return self.arrangement == "moving-scanner"
+
+    @property
+    def turntable(self) -> bool:
+        return "turntable" in (self.arrangement, self.method)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,6 +145,13 @@ def require_arrangement(o: CalibrationOptions) -> None:
     if o.arrangement not in ARRANGEMENTS:
         raise typer.BadParameter(
             f"{o.arrangement!r} is unknown; choose one of {', '.join(ARRANGEMENTS)}", param_hint="--arrangement"
+        )
+    if o.method not in METHODS:
+        raise typer.BadParameter(f"{o.method!r} is unknown; choose one of {', '.join(METHODS)}", param_hint="--method")
+    if o.turntable and (o.twin is not None or o.manipulator is not None or o.moving_scanner):
+        raise typer.BadParameter(
+            "a table that turns alone has no manipulator; leave out --manipulator, --twin and --arrangement",
+            param_hint="--method" if o.method == "turntable" else "--arrangement",
         )
     if (o.twin is None) != (o.source_poses is None):
         lost, there = ("--twin", "--source-poses") if o.twin is None else ("--source-poses", "--twin")
@@ -178,9 +201,25 @@ def read_inputs(o: CalibrationOptions) -> Inputs:
         )  # fmt: skip
         note_missing_flat(o.say, o.flat)
         observations = observe(o.say, scanner, images, poses, ball_diameter=o.ball_diameter, workers=o.workers)
+    observations = part_of_run(observations, poses, o.from_pose, o.until_pose)
     return Inputs(
         scanner=scanner, poses=poses, observations=observations, images=images, manipulator=manipulator, twin=twin
     )
+
+
+def part_of_run(
+    observations: BallObservations, poses: PoseSequence, first: str | None, stop: str | None
+) -> BallObservations:
+    """The centres of the poses from `first` on and before `stop`, in the order of the pose table."""
+    if first is None and stop is None:
+        return observations
+    ends = {}
+    for option, pose in (("--from-pose", first), ("--until-pose", stop)):
+        if pose is not None and pose not in poses.pose_id:
+            raise typer.BadParameter(f"the pose table has no pose {pose!r}", param_hint=option)
+        ends[option] = None if pose is None else poses.pose_id.index(pose)
+    kept = set(poses.pose_id[ends["--from-pose"] : ends["--until-pose"]])
+    return observations.select([k for k, name in enumerate(observations.pose_id) if name in kept])
 
 
 def twin_robots(o: CalibrationOptions, given: Inputs) -> TwinRobots:
@@ -220,6 +259,10 @@ def solve(o: Options, given: Inputs) -> Calibration:
         if given.twin is not None:
             robots, mount = twin_robots(o, given), given.twin.mount(scanner)
             return tp.calibrate_twin(scanner, poses, observations, twin=robots, mount=mount, **settings)
+        if o.turntable:
+            return tp.calibrate_turntable(
+                scanner, poses, observations, free=free, fix=names(o.fix), distances=scale_bars(o.distance)
+            )
         if o.moving_scanner:
             return tp.calibrate_inverse(
                 scanner, poses, observations, manipulator=given.manipulator, d_SD_sigma=o.distance_sigma, **settings
@@ -266,8 +309,10 @@ def calibrate(options: Options) -> int:
             distance=o.distance,
             ball_diameter_mm=given.observations.ball_diameter,
             images=None if o.images is None else len(given.observations),
-            arrangement="twin" if given.twin is not None else o.arrangement,
+            arrangement=result.arrangement,
             d_sd_sigma_mm=o.distance_sigma or None,
+            from_pose=o.from_pose,
+            until_pose=o.until_pose,
         ),
     )
     result = replace(result, provenance=made)

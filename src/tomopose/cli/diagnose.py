@@ -50,6 +50,8 @@ def ranking(o: Options, given: Inputs) -> Diagnosis:
     if given.twin is not None:
         robots, mount = twin_robots(o, given), given.twin.mount(given.scanner)
         return tp.diagnose_twin(given.scanner, poses, observed, twin=robots, mount=mount, free=free, fix=fix)
+    if o.turntable:
+        return tp.diagnose_turntable(given.scanner, poses, observed, free=free, fix=fix)
     return tp.diagnose(given.scanner, poses, observed, free=free, fix=fix, moving_scanner=o.moving_scanner)
 
 

@@ -186,7 +186,7 @@ def calibration_summary(calibration: Calibration) -> tuple[dict[str, Any], list[
     }
     lines = [
         f"{calibration.verdict}: {calibration.status}{first_explanation(calibration)}",
-        *(f"  - {reason}" for reason in calibration.reasons),
+        *(f"  - {line}" for line in doubts(calibration)),
         *(f"  {words}" for words in notes(calibration)),
         f"  d_rms {calibration.d_rms:.4g} px ({calibration.d_rms_um:.3g} um at the object), "
         f"{len(calibration.pose_id)} poses, {len(calibration.outliers)} set aside",
@@ -194,6 +194,12 @@ def calibration_summary(calibration: Calibration) -> tuple[dict[str, Any], list[
         *([f"  and {more} of the manipulator's own errors (--json and the report list them)"] if more else []),
     ]
     return summary, lines
+
+
+def doubts(calibration: Calibration) -> list[str]:
+    """Every reason for doubt, worst first, with what to do where something is known and the reason does not say it."""
+    found = sorted((f for f in calibration.checks if f.verdict != "trustworthy"), key=lambda f: f.verdict != "rejected")
+    return [f.words if not f.remedy or f.remedy in f.words else f"{f.words}; {f.remedy}" for f in found]
 
 
 def first_explanation(calibration: Calibration) -> str:

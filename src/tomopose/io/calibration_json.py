@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.result import Calibration, Parameter
+from tomopose.calibration.result import SCANNER_MOVES, Calibration, Parameter
 from tomopose.calibration.rigid.observability import Observability
 from tomopose.coverage import expanded_k2
 from tomopose.errors import FileError, InputError
@@ -186,7 +186,7 @@ def _calibration(document: Mapping[str, Any], where: str) -> Calibration:
         not_seen=dict(document["not_seen"]),
         model=document["model"],
         arrangement=document["arrangement"],
-        errors=errors_from_document(document["manipulator"], inverse=document["arrangement"] != "moving-object"),
+        errors=errors_from_document(document["manipulator"], inverse=document["arrangement"] in SCANNER_MOVES),
         priors={name: _number(sigma) for name, sigma in document["priors"].items()},
         **assumptions.from_document(document, m),
         converged=bool(document["converged"]),

@@ -12,6 +12,7 @@ from tomopose.calibration.checks.conventions import ALTERNATIVES_OF_MOVING_SCANN
 from tomopose.calibration.identified.calibrate import calibrate_kinematic, machine_of
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.result import Calibration, ViewDistances
+from tomopose.calibration.rigid.contradiction import as_stated
 from tomopose.calibration.solve import freed_names, rigid_calibration
 from tomopose.errors import InputError, NotConvergedError, NotObservableError
 from tomopose.geometry.scanner import Scanner
@@ -96,7 +97,6 @@ def calibrate_inverse(
         raise
     if found.verdict == "rejected":
         return found
-    assumed = found.assumed
     if machine is not None or d_SD_sigma or model not in ("auto", "rigid"):
         found = calibrate_kinematic(
             scanner,
@@ -105,12 +105,12 @@ def calibrate_inverse(
             rigid=found,
             manipulator=None if machine is None else InverseManipulator(machine=machine),
             model="rigid" if machine is None and model == "auto" else model,
-            free=freed,
+            free=as_stated(freed, found.contradicted),
+            auto=auto,
             distances=distances,
             inverse=True,
             view_sigma={"d_SD": d_SD_sigma} if d_SD_sigma else None,
         )
-        found = replace(found, assumed=assumed)
     if not d_SD_sigma:
         return found
     seen = observations.select(np.isin(observations.pose_id, found.pose_id))

@@ -14,7 +14,8 @@ from tomopose.calibration.identified.map_estimate import KinematicProblem, State
 from tomopose.calibration.identified.model_selection import better, judged
 from tomopose.calibration.identified.result import calibration_of
 from tomopose.calibration.identified.scale_bars import require_balls_not_swapped
-from tomopose.calibration.model.assumed import assumed_for, with_assumed
+from tomopose.calibration.identified.scatter import with_posterior_scatter
+from tomopose.calibration.model.assumed import assumed_for, scatter_assumed, with_assumed
 from tomopose.calibration.model.parameters import MATTERS, UNITS, FreeParameters, free_parameters, unit_of
 from tomopose.calibration.model.problem import pair
 from tomopose.calibration.model.twin_projection import balls_from_rays, twin_view_matrices
@@ -102,7 +103,7 @@ def calibrate_twin(
         raise InputError(f"unknown model {model!r}; known are {', '.join(MODELS)}")
     if np.asarray(poses.alpha).any():
         raise InputError("the arrangement with a fixed object has no rotary table; alpha must be 0 in every pose")
-    free, _ = freed_names(free)
+    free, auto = freed_names(free)
     others = [name for name in PARAMETER_UNITS if name not in PANEL]
     assumed = assumed_for(scanner, free=free, fix=fix, priors=dict(priors or {}), no_effect=others)
     freed = panel_parameters(with_assumed(scanner, assumed), free=free, fix=fix, priors=priors)
@@ -134,7 +135,7 @@ def calibrate_twin(
             bars=known_bars(distances, data),
         )
         begin = replace(start, p=np.concatenate([np.zeros(len(machines.names) - 9), start.p]))
-        fits[name] = fit_model(problem, begin, robust=robust and name == "kinematic")
+        fits[name] = fit_model(problem, begin, robust=robust and name == "kinematic", widen=auto)
         start = fits[name].estimate.state
     found = {name: judged(name, fit) for name, fit in fits.items()}
     chosen = model
@@ -143,6 +144,7 @@ def calibrate_twin(
     fit = max(fits.values(), key=lambda f: f.estimate.log_evidence)
     require_balls_not_swapped(fit, fit.estimate.problem if fit.keep.all() else problem)
     _require_panel_known(fits[chosen])
+    fits[chosen] = with_posterior_scatter(fits[chosen])
     return calibration_of(
         fits,
         found,
@@ -152,6 +154,7 @@ def calibrate_twin(
         arrangement="twin",
         magnification_at_ball=_magnification_at_balls(fits[chosen]),
         view_matrices=_view_matrices(fits[chosen]),
+        assumed=(*assumed, *scatter_assumed(twin.repeatability.t_mm, twin.repeatability.w_rad, "option")),
         source_poses=twin.source_poses.select(twin.source_poses.index_of(data.pose_id)),
         provenance=provenance(arguments={"model": model}),
     )

@@ -292,6 +292,10 @@ IMAGE_STEP_ODDS = -8.0
 few poses come after the step."""
 
 
+PIVOT_STEP_ODDS = -2.0
+"""A pivot is changed by hand; a ball that slips, which looks alike where the poses hardly turn, is likelier."""
+
+
 def _step_effect(name: str, short: str, text: str, part: slice, factor: float, unit: str, odds: float = 0.0) -> Effect:
     def words(size: Array, px: float, at: str) -> str:
         return f"{text} at pose {at}, by {np.linalg.norm(size[part]) * factor:.2g} {unit}"
@@ -300,7 +304,7 @@ def _step_effect(name: str, short: str, text: str, part: slice, factor: float, u
 
 
 def steps_of(problem: Problem, b: ProjectionBlocks) -> list[Steps]:
-    """What may change from one pose to the next: the ball, the mount, the images."""
+    """What may change from one pose to the next: the ball, the mount, the pivot, the images."""
     n = len(problem)
     J_mount = problem.W @ b.J_mount
     return [
@@ -322,6 +326,20 @@ def steps_of(problem: Problem, b: ProjectionBlocks) -> list[Steps]:
             ),
             C=J_mount,
             least=3,
+        ),
+        Steps(
+            effect=_step_effect(
+                "pivot step",
+                "the pivot of the controller changed",
+                "the pivot of the controller changed",
+                slice(0, 3),
+                1000.0,
+                "um",
+                PIVOT_STEP_ODDS,
+            ),
+            # a pivot off by c shifts H against the base and M against the plate: t_HT += R_HT c, t -= c
+            C=problem.W @ (b.J_t_HT @ _mount(b) - b.J_t),
+            least=2,
         ),
         Steps(
             effect=_step_effect(

@@ -405,21 +405,18 @@ def scanner_tests(problem: Problem, free: FreeParameters, fit: Fit) -> ScannerTe
         return ScannerTests(beside=beside, declared=beside, gain=0.0)
     before = whitened(problem, held, plain)
     declared = ranked_explanations(problem, before, [*effects_of(problem, blocks(problem, held, plain))], steps, most=1)
-    left = max(beside.chi2, 1e-300)
-    fits = min((declared.chi2 - left) / 2, declared.dof / 2 * float(np.log(max(declared.chi2, 1e-300) / left)))
-    together = fits - _occam(before, free, problem, b)
+    known = np.isfinite(free.sigma)
+    C = (problem.W @ (b.J_scanner[:, :, free.cols] * free.factor)).reshape(2 * len(problem), -1)[:, known]
+    together = evidence_together(beside, declared, before, C * free.sigma[known])
     # as assumed, not as widened where the images contradict it
     return ScannerTests(beside=beside, declared=declared, gain=together, sigma=problem.scanner.sigma)
 
 
-def _occam(before: Whitened, free: FreeParameters, problem: Problem, b: object) -> float:
-    """Half the log determinant of 1 + prior x information: what the freedom of the assumed values costs."""
-    from tomopose.calibration.model.ball_projection import ProjectionBlocks
-
-    assert isinstance(b, ProjectionBlocks)
-    known = np.isfinite(free.sigma)
-    C = (problem.W @ (b.J_scanner[:, :, free.cols] * free.factor)).reshape(2 * len(problem), -1)[:, known]
-    C = C * free.sigma[known]
+def evidence_together(beside: Ranked, declared: Ranked, before: Whitened, C: Array) -> float:
+    """Evidence for all assumed values together against the declared ones.  C (2 n, a): whitened, a prior sigma each."""
+    left = max(beside.chi2, 1e-300)
+    fits = min((declared.chi2 - left) / 2, declared.dof / 2 * float(np.log(max(declared.chi2, 1e-300) / left)))
+    # half the log determinant of 1 + prior x information: what the freedom of the assumed values costs
     Q = _basis(before.A[: 2 * before.n])
     C = C - Q @ (Q.T @ C)
-    return 0.5 * float(np.linalg.slogdet(np.eye(C.shape[1]) + C.T @ C)[1])
+    return fits - 0.5 * float(np.linalg.slogdet(np.eye(C.shape[1]) + C.T @ C)[1])

@@ -21,6 +21,7 @@ from tomopose.calibration.identified.model_selection import EVIDENCE_GAIN, bette
 from tomopose.calibration.identified.pose_map import map_candidates
 from tomopose.calibration.identified.result import calibration_of, comparison, scatter_of_fit
 from tomopose.calibration.identified.scale_bars import require_balls_not_swapped
+from tomopose.calibration.identified.scatter import with_posterior_scatter
 from tomopose.calibration.model.parameters import FreeParameters, base_name, free_parameters
 from tomopose.calibration.model.problem import Problem, pair
 from tomopose.calibration.result import Calibration, ModelJudgement
@@ -57,6 +58,7 @@ def calibrate_kinematic(
     view_sigma: Mapping[str, float] | None = None,
     inverse: bool = False,
     robust: bool = True,
+    auto: bool = False,
 ) -> Calibration:
     """Find the mount, the balls and the manipulator's errors together: a maximum a posteriori estimate.
 
@@ -73,6 +75,7 @@ def calibrate_kinematic(
     view_sigma:   scanner parameter -> standard deviation of its scatter from view to view.
     inverse:      the table holds inverse poses, those of a scanner that moves.
     robust:       set aside centres that do not belong.
+    auto:         free scanner values whose priors the images contradict beside the machine's errors.
 
     Raises
     ------
@@ -108,7 +111,8 @@ def calibrate_kinematic(
         candidates.append(("kinematic", machine))
     if model == "slack":
         candidates += map_candidates(problem, start)
-    fits = _fit_all(problem, start, candidates, robust, needed="kinematic" if model == "kinematic" else "rigid")
+    needed = "kinematic" if model == "kinematic" else "rigid"
+    fits = _fit_all(problem, start, candidates, robust, needed=needed, widen=auto)
     best = max(fits.values(), key=lambda f: f.estimate.log_evidence)
     require_balls_not_swapped(best, problem)
     found = {name: judged(name, fit) for name, fit in fits.items()}
@@ -116,7 +120,7 @@ def calibrate_kinematic(
     if chosen == "rigid" and model == "auto" and not (problem.bars or problem.view_sigma):
         errors = RigidErrors(translation_scale=_scale_of(rigid), scatter=scatter_of_fit(fits["rigid"]))
         return replace(rigid, errors=errors, comparison=comparison(found, fits, chosen))
-    fits[chosen] = averaged(fits[chosen])
+    fits[chosen] = averaged(with_posterior_scatter(fits[chosen]))
     earlier = {} if rigid.provenance is None else dict(rigid.provenance.arguments)
     return calibration_of(
         fits,
@@ -127,6 +131,7 @@ def calibrate_kinematic(
         arrangement="moving-scanner" if problem.inverse else rigid.arrangement,
         magnification_at_ball=rigid.magnification_at_ball,
         diagnosis=Diagnosis(hypotheses=rigid.hypotheses) if rigid.hypotheses else None,
+        assumed=rigid.assumed,
         provenance=provenance(arguments={**earlier, "model": model}),
     )
 
@@ -205,6 +210,7 @@ def _fit_all(
     candidates: Sequence[tuple[str, ErrorModel | None]],
     robust: bool,
     needed: str,
+    widen: bool,
 ) -> dict[str, ModelFit]:
     """The candidates' fits, simplest first, all on the rows that belong for the richest: evidence compares only so.
 
@@ -218,10 +224,10 @@ def _fit_all(
             begin = replace(start, p=np.zeros(len(machine.names)))
         try:
             if keep is None:
-                fits[name] = _with_run_effects(own, fit_model(own, begin, robust=robust))
+                fits[name] = _with_run_effects(own, fit_model(own, begin, robust=robust, widen=widen))
                 keep, misfit = fits[name].keep, fits[name].misfit
             else:
-                fits[name] = replace(fit_model(own, begin, keep=keep), misfit=misfit)
+                fits[name] = replace(fit_model(own, begin, keep=keep, widen=widen), misfit=misfit)
         except NotConvergedError:
             if name in ("rigid", needed):
                 raise
@@ -239,11 +245,11 @@ def _with_run_effects(problem: KinematicProblem, fit: ModelFit) -> ModelFit:
     more = np.zeros(len(model.names) - len(machine.names))
     start = replace(estimate.state, p=np.concatenate([estimate.state.p, more]))
     try:
-        other = fit_model(replace(problem, model=model), start, keep=fit.keep)
+        other = fit_model(replace(problem, model=model, free=estimate.problem.free), start, keep=fit.keep)
     except NotConvergedError:
         return fit
     if other.estimate.log_evidence > estimate.log_evidence + EVIDENCE_GAIN:
-        return replace(other, size=fit.size, misfit=fit.misfit)
+        return replace(other, size=fit.size, misfit=fit.misfit, contradicted=fit.contradicted)
     return fit
 
 

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
+from tomopose.calibration.identified.contradiction import contradicted_beside_errors
 from tomopose.calibration.identified.map_estimate import KinematicProblem, MapEstimate, State, linearise, solve_map
 from tomopose.calibration.model.ball_projection import whiteners
 from tomopose.calibration.model.covariance import WIDENING_PROBABILITY
+from tomopose.calibration.rigid.contradiction import Contradicted
 from tomopose.calibration.rigid.outliers import LARGEST_SHARE, MEDIAN_CHI2_2, RECLASSIFICATIONS, limit
 from tomopose.errors import NotConvergedError
 from tomopose.manipulator.pose_map import PoseMap
@@ -39,15 +41,19 @@ class ModelFit:
     """A model's optimum and how it was reached.
 
     keep (n,) bool: rows used, of all rows.  distance2 (n,): squared studentised residuals of all rows.
+    whole: the problem of all rows, with the scatter and the sizes that were found.
     size: largest factor on the stated standard deviations of the errors.
+    contradicted: scanner values that were freed because the images contradict what was assumed of them.
     misfit: more rows fail than may be outliers, and none was set aside.
     """
 
     estimate: MapEstimate
     keep: Any
     distance2: Array
+    whole: KinematicProblem
     size: float = 1.0
     misfit: bool = False
+    contradicted: tuple[Contradicted, ...] = ()
 
     @property
     def scatter(self) -> float:
@@ -144,10 +150,13 @@ def with_size(estimate: MapEstimate) -> tuple[MapEstimate, float]:
     return (now, float(sizes.max())) if taken else (estimate, 1.0)
 
 
-def fit_model(problem: KinematicProblem, start: State, *, robust: bool = True, keep: Any = None) -> ModelFit:
+def fit_model(
+    problem: KinematicProblem, start: State, *, robust: bool = True, keep: Any = None, widen: bool = False
+) -> ModelFit:
     """The optimum of a model from a start, with scatter and size from the data.
 
     keep: (n,) rows to use; without it those that belong are found (robust) or all are used.
+    widen: free scanner values whose priors the images contradict.
     """
     n = len(problem.poses)
     given = keep is not None
@@ -157,6 +166,7 @@ def fit_model(problem: KinematicProblem, start: State, *, robust: bool = True, k
         estimate, keep, misfit = _robust(problem, start)
     else:
         estimate = solve_softened(problem if keep.all() else problem.rows(keep), start)
+    estimate, against = contradicted_beside_errors(estimate) if widen else (estimate, ())
     scattered = with_scatter(estimate)
     estimate, size = with_size(scattered)
     if estimate is not scattered:
@@ -165,8 +175,17 @@ def fit_model(problem: KinematicProblem, start: State, *, robust: bool = True, k
         if size > 1.0 and estimate.problem.scatter > 1.0:
             quiet = with_scatter(solve_softened(replace(estimate.problem, scatter=1.0), estimate.state))
             estimate = max(estimate, quiet, key=lambda e: e.log_evidence)
-    whole = replace(problem, scatter=estimate.problem.scatter, model=estimate.problem.model)
-    return ModelFit(estimate=estimate, keep=keep, distance2=distances(estimate, whole, keep), size=size, misfit=misfit)
+    last = estimate.problem
+    whole = replace(problem, scatter=last.scatter, model=last.model, free=last.free)
+    return ModelFit(
+        estimate=estimate,
+        keep=keep,
+        distance2=distances(estimate, whole, keep),
+        whole=whole,
+        size=size,
+        misfit=misfit,
+        contradicted=against,
+    )
 
 
 def _scale(d2: Array) -> float:

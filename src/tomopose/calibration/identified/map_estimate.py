@@ -20,9 +20,19 @@ from typing import Any
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
-from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks, whiteners
+from tomopose.calibration.model.ball_projection import (
+    SCANNER_COLUMNS,
+    ProjectionBlocks,
+    projection_blocks,
+    whiteners,
+)
 from tomopose.calibration.model.linear_fit import LinearFit
-from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, translation_scale
+from tomopose.calibration.model.parameters import (
+    FreeParameters,
+    ImpossibleScannerError,
+    adjusted_scanners,
+    translation_scale,
+)
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.model.twin_projection import twin_blocks
 from tomopose.calibration.rigid.fit import tangent_names
@@ -39,6 +49,8 @@ STEPS = 50
 COST_TOLERANCE, VALLEY_TOLERANCE = 1e-6, 1e-4
 """Relative to the number of equations: a step that gains less than the first in chi2 ends the iteration; the second, a
 fifth of a standard deviation at most, is accepted after all steps in a flat valley."""
+EXACT = 1e-10
+"""mm and rad: standard deviation of a mount that is known by definition."""
 LEAST_DAMPING, LARGEST_DAMPING = 1e-6, 1e8
 
 
@@ -54,6 +66,7 @@ class KinematicProblem:
     repeatability, scatter:  of the plate from pose to pose, and the factor f on its variance.
     inverse:     the table holds inverse poses: the plate is H, and turns about the origin of H.
     weight:      (n,) factor on the inverse covariances of the rows, or None.
+    mount_known: T_HT stays where it starts, by definition.
     """
 
     data: Problem
@@ -66,6 +79,7 @@ class KinematicProblem:
     scatter: float = 1.0
     inverse: bool = False
     weight: Array | None = None
+    mount_known: bool = False
 
     @property
     def tangent(self) -> tuple[str, ...]:
@@ -76,6 +90,7 @@ class KinematicProblem:
     def prior_sigma(self) -> Array:
         """Prior standard deviation of each coordinate of theta; inf where there is no limit."""
         flat = np.full(6 + 3 * len(self.data.ball_ids), np.inf)
+        flat[:6] = EXACT if self.mount_known else np.inf
         return np.concatenate([flat, self.free.sigma, np.zeros(0) if self.model is None else self.model.sigma])
 
     def rows(self, index: Any) -> KinematicProblem:
@@ -137,20 +152,9 @@ def linearise(problem: KinematicProblem, state: State) -> Linearised:
         return _linearise_twin(problem, problem.model, state)
     data, poses, free = problem.data, problem.poses, problem.free
     n, nb = len(poses), len(data.ball_ids)
-    T_MH, J_errors = poses.T_MH, np.zeros((n, 6, 0))
-    if problem.model is not None:
-        real = problem.model.real_poses(poses, state.p)
-        T_MH, J_errors = real.T_MH, real.J
+    T_MH, J_errors = _executed(problem, state)
     scale = translation_scale(free, state.delta)
-    blocks = projection_blocks(
-        adjusted_scanners(data.scanners, free, state.delta),
-        T_HT=state.T_HT,
-        T_MH=T_MH,
-        t=state.balls[data.ball],
-        alpha=data.alpha,
-        translation_scale=scale,
-        run=data.run,
-    )
+    blocks = _blocks(problem, state, T_MH)
     J_pose = np.concatenate([-blocks.G_H @ skew(blocks.x_H - scale * T_MH.t), scale * blocks.G_H], axis=2)
     J_balls = np.zeros((n, 2, nb, 3))
     J_balls[np.arange(n), :, data.ball] = blocks.J_t
@@ -167,6 +171,52 @@ def linearise(problem: KinematicProblem, state: State) -> Linearised:
     if problem.weight is not None:
         C = C / problem.weight[:, None, None]
     return Linearised(r=data.x_D - blocks.x_D, J=J, C=C, J_pose=J_plate)
+
+
+def _executed(problem: KinematicProblem, state: State) -> tuple[RigidTransform, Array]:
+    """(T_MH of the real plate, its derivative (n, 6, m) by the manipulator's errors)."""
+    if problem.model is None:
+        return problem.poses.T_MH, np.zeros((len(problem.poses), 6, 0))
+    real = problem.model.real_poses(problem.poses, state.p)
+    return real.T_MH, real.J
+
+
+def _blocks(problem: KinematicProblem, state: State, T_MH: RigidTransform) -> ProjectionBlocks:
+    data, free = problem.data, problem.free
+    return projection_blocks(
+        adjusted_scanners(data.scanners, free, state.delta),
+        T_HT=state.T_HT,
+        T_MH=T_MH,
+        t=state.balls[data.ball],
+        alpha=data.alpha,
+        translation_scale=translation_scale(free, state.delta),
+        run=data.run,
+    )
+
+
+def blocks_of(problem: KinematicProblem, state: State) -> ProjectionBlocks:
+    """Projected centres and derivatives at theta, as the tests of single effects look at them.
+
+    Of twin robots x_H and G_H are those of the panel's flange, with which the focal spot does not move.
+    """
+    twin = problem.model
+    if not isinstance(twin, TwinRobots):
+        return _blocks(problem, state, _executed(problem, state)[0])
+    (scanner,) = adjusted_scanners(problem.data.scanners, problem.free, state.delta)
+    t = state.balls[problem.data.ball]
+    b = twin_blocks(scanner, twin, T_HT=state.T_HT, poses=problem.poses, p=state.p, t=t)
+    real = twin.real_poses(problem.poses, state.p)
+    return ProjectionBlocks(
+        x_D=b.x_D,
+        J_w_HT=b.J_mount[:, :, :3],
+        J_t_HT=b.J_mount[:, :, 3:],
+        J_t=b.J_t,
+        J_scanner=b.J_scanner,
+        x_H=np.einsum("nij,nj->ni", real.R, t) + real.t,
+        t=t,
+        R_MH=real.R,
+        G_H=b.J_plate[:, :, 3:],
+    )
 
 
 def _linearise_twin(problem: KinematicProblem, twin: TwinRobots, state: State) -> Linearised:
@@ -257,7 +307,7 @@ def solve_map(problem: KinematicProblem, start: State) -> MapEstimate:
                 try:
                     new = _weighted(problem, trial, W)
                     drop = float(r @ r - new[0] @ new[0]) if np.isfinite(new[0]).all() else -np.inf
-                except TrajectoryError:  # errors so large that the machine cannot reach its own poses
+                except (TrajectoryError, ImpossibleScannerError):  # no machine, or no scanner, has such errors
                     drop = -np.inf
             if drop > -COST_TOLERANCE * len(r):
                 break
@@ -309,10 +359,15 @@ def _estimate(problem: KinematicProblem, state: State, r: Array, J: Array, at: L
 
 def linear_fit(estimate: MapEstimate) -> LinearFit:
     """The estimate as the checks look at it: centres, and priors and bars as rows of their own."""
-    r, J, at, W = _weighted(estimate.problem, estimate.state)
+    return linear_at(estimate.problem, estimate.state)
+
+
+def linear_at(problem: KinematicProblem, state: State) -> LinearFit:
+    """The same of any rows at any state, such as all rows at the optimum of those that were used."""
+    r, J, at, W = _weighted(problem, state)
     k = at.r.size
     return LinearFit(
-        problem=estimate.problem.data,
+        problem=problem.data,
         r=at.r,
         J=at.J,
         C=at.C,

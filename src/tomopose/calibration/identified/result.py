@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from tomopose.calibration.build import Fitted, ManipulatorEvidence, build, expected_px
 from tomopose.calibration.checks.convention_tests import Diagnosis
-from tomopose.calibration.checks.evidence.evidence import AgainstRigid, ScatterFound
+from tomopose.calibration.checks.evidence.evidence import RAISED_SCATTER, AgainstRigid, ScatterFound
+from tomopose.calibration.checks.evidence.fit_tests import score_tests
+from tomopose.calibration.checks.evidence.measures import EFFECT_SHARE
+from tomopose.calibration.checks.scanner_tests import ScannerTests, rows_to_test
 from tomopose.calibration.identified.fit import ModelFit
-from tomopose.calibration.identified.map_estimate import linear_fit, linearise, singular_values
+from tomopose.calibration.identified.map_estimate import blocks_of, linear_at, linear_fit, linearise, singular_values
 from tomopose.calibration.identified.model_selection import better, by_rotation
 from tomopose.calibration.identified.pose_map import determined_turns
+from tomopose.calibration.model.assumed import Assumed
+from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import translation_scale
 from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.model.unseen import Unseen, unseen_of
 from tomopose.calibration.result import Arrangement, Calibration, ModelComparison, ModelJudgement, ViewDistances
+from tomopose.calibration.rigid.contradiction import NOTHING_FITS
 from tomopose.calibration.rigid.observability import Observability
 from tomopose.manipulator.error_models import (
     EmpiricalErrors,
@@ -126,8 +134,6 @@ def _stated_px(fit: ModelFit) -> float:
         return expected_px(linear_fit(e))
     linear = linear_fit(e)
     n, m = len(linear.r), max(linear.J.shape[2] - len(linear.prior_rows), 0)
-    from dataclasses import replace
-
     at = linearise(replace(problem, scatter=1.0), e.state)
     total = float(np.trace(at.C, axis1=1, axis2=2).mean())
     return float(np.sqrt(total * max(1.0 - m / (2 * n), 0.0)))
@@ -163,6 +169,7 @@ def calibration_of(
     arrangement: Arrangement,
     magnification_at_ball: float | None,
     diagnosis: Diagnosis | None = None,
+    assumed: tuple[Assumed, ...] = (),
     source_poses: PoseSequence | None = None,
     views: ViewDistances | None = None,
     view_matrices: Array | None = None,
@@ -209,8 +216,46 @@ def calibration_of(
             views=views,
             magnification_at_ball=magnification_at_ball,
             view_matrices=view_matrices,
+            assumed=assumed,
+            contradicted=fit.contradicted,
+            tests=_tests(fit),
+            unseen=_unseen(fit, linear),
             provenance=provenance,
         )
+    )
+
+
+def _tests(fit: ModelFit) -> ScannerTests | None:
+    """One effect after the other, on all rows but those that chance may have spoilt; None where nothing fits."""
+    e = fit.estimate
+    if e.chi2 > NOTHING_FITS * 2 * len(e.problem.data):
+        return None
+    problem = fit.whole.rows(rows_to_test(fit.keep))
+    # what a twin's robots may do is in its errors; a table that turns alone has no manipulator
+    still = isinstance(problem.model, TwinRobots) or problem.mount_known
+    without = ("manipulator",) if still else ()
+    at, b = linear_at(problem, e.state), blocks_of(problem, e.state)
+    # backlash and other play of a machine are no white noise, of which chance makes what looks significant
+    played = fit.scatter > RAISED_SCATTER or isinstance(problem.model, WithRunEffects)
+    least = EFFECT_SHARE if played else 0.0
+    return score_tests(at, b, problem.free, e.state.delta, without=without, least_share=least)
+
+
+def _unseen(fit: ModelFit, linear: LinearFit) -> Unseen | None:
+    """What no ball shows; of twin robots the tolerances of links and set-up hold the scale of everything."""
+    e = fit.estimate
+    problem = e.problem
+    if isinstance(problem.model, TwinRobots):
+        return None
+    return unseen_of(
+        blocks_of(problem, e.state),
+        e.covariance,
+        linear.J,
+        linear.C,
+        T_HT=e.state.T_HT,
+        origin=problem.data.t_MH,
+        alpha=problem.data.alpha,
+        moving_scanner=problem.inverse,
     )
 
 

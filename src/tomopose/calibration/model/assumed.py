@@ -151,3 +151,14 @@ def taken_as_known(
     assumed = [assumed_for(s, free=free, fix=fix, priors=priors, no_effect=no_effect) for s in scanners]
     known = tuple(with_assumed(s, a) for s, a in zip(scanners, assumed, strict=True))
     return assumed[0], known, free_parameters(known, free=free, fix=fix, priors=priors)
+
+
+def scatter_assumed(t_mm: float, w_rad: float, source: Source) -> tuple[Assumed, ...]:
+    """The prior of the poses' scatter, a coordinate each.
+
+    Backlash and periodic errors of drives, which one ball cannot distinguish from scatter, are within it.
+    """
+    return (
+        Assumed(name="scatter_and_backlash_t", sigma=t_mm, unit="mm", source=source),
+        Assumed(name="scatter_and_backlash_w", sigma=w_rad, unit="rad", source=source),
+    )

@@ -18,19 +18,22 @@ class ScanBudget:
     """px, root mean square over views, points and coordinates.
 
     total: with everything;  measured: if all that was assumed were exact;  shares: assumed name -> its part, largest
-    first;  two_angles: the same poses, half of them at a second table angle; None where that is no remedy.
+    first;  two_angles: the same poses, half of them at a second table angle; None where that is no remedy;
+    tilted: the scan tilts the plate by 5 degrees, else the table turns alone.
     """
 
     total: float
     measured: float
     shares: tuple[tuple[str, float], ...] = ()
     two_angles: float | None = None
+    tilted: bool = True
 
 
 def budget_words(budget: ScanBudget, assumed: tuple[Assumed, ...]) -> str:
     """The sentence of the first screen, such as "0.12 px, of which 0.116 px from d_SR (no sigma given; 0.05 mm
     assumed). Two table angles would make it 0.001 px."."""
-    words = f"a tilted scan carries {budget.total:.2g} px of standard uncertainty, as a volume sees it"
+    scan = "tilted" if budget.tilted else "circular"
+    words = f"a {scan} scan carries {budget.total:.2g} px of standard uncertainty, as a volume sees it"
     known = {a.name: a for a in assumed}
     parts: list[str] = []
     for name, px in budget.shares:

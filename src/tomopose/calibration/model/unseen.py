@@ -77,16 +77,23 @@ def turns(R: Array) -> Array:
 
 
 def unseen_columns(
-    names: tuple[str, ...], b: ProjectionBlocks, *, T_HT: RigidTransform, origin: Array, alpha: Array
+    names: tuple[str, ...],
+    b: ProjectionBlocks,
+    *,
+    T_HT: RigidTransform,
+    origin: Array,
+    alpha: Array,
+    about_H: bool = False,
 ) -> Array:
     """(n, 2, c) px by a unit of each: of the balls or points that `b` projects.
 
-    origin (n, 3): the plate's origin in H, mm;  alpha (n,): table angle, rad.
+    origin (n, 3): the plate's origin in H, mm;  alpha (n,): table angle, rad;  about_H: the poses are inverse ones, of
+    a scanner that moves, and turn about the origin of H.
     """
     M = R_z(alpha)
     G_W = b.J_t_HT @ np.swapaxes(M, 1, 2)
     x_W = np.einsum("nij,nj->ni", M, b.x_H @ T_HT.R.T + T_HT.t)
-    by_turn = -b.G_H @ skew(b.x_H - origin)
+    by_turn = -b.G_H @ skew(b.x_H if about_H else b.x_H - origin)
     by_tilt = -G_W @ skew(x_W)
     w = turns(b.R_MH)
     columns = []
@@ -110,3 +117,23 @@ def unseen_gain(names: tuple[str, ...], covariance: Array, J: Array, V: Array, C
     weighted = np.linalg.solve(V, C)
     gain = covariance @ np.einsum("nim,nic->mc", J, weighted)
     return Unseen(names=names, sigma=unseen_sigma(names), gain=gain)
+
+
+def unseen_of(
+    b: ProjectionBlocks,
+    covariance: Array,
+    J: Array,
+    V: Array,
+    *,
+    T_HT: RigidTransform,
+    origin: Array,
+    alpha: Array,
+    moving_scanner: bool,
+) -> Unseen:
+    """What no ball shows of table and manipulator, and how the estimate of any model answers to it.
+
+    b: of the rows used;  covariance (m, m), J (n, 2, m), V (n, 2, 2): of the fit;  the others as of `unseen_columns`.
+    """
+    names = unseen_names(b.R_MH, table=not moving_scanner)
+    C = unseen_columns(names, b, T_HT=T_HT, origin=origin, alpha=alpha, about_H=moving_scanner)
+    return unseen_gain(names, covariance, J, V, C)

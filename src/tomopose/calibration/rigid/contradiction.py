@@ -44,10 +44,10 @@ def contradicted(problem: Problem, free: FreeParameters, fit: Fit) -> tuple[Free
     if fit.chi2 > NOTHING_FITS * 2 * len(problem):
         return free, ()
     for _ in range(MOST):
-        candidates = _candidates(free, fit)
+        candidates = pulled(free, fit.delta)
         tried: list[tuple[float, int, FreeParameters, Fit]] = []
         for j in candidates:
-            wider = _widened(free, j)
+            wider = widened(free, j)
             other = minimise(problem, wider, fit, iterations=20)
             if np.isfinite(other.chi2) and _sigma(other)[j - len(free)] < DETERMINED * wider.sigma[j]:
                 tried.append((other.chi2, j, wider, other))
@@ -61,13 +61,15 @@ def contradicted(problem: Problem, free: FreeParameters, fit: Fit) -> tuple[Free
     return free, tuple(found)
 
 
-def _candidates(free: FreeParameters, fit: Fit) -> list[int]:
+def pulled(free: FreeParameters, delta: Array) -> list[int]:
+    """Which freed parameters lie beyond `CONTRADICTED` prior standard deviations, farthest first, six at most."""
     known = np.isfinite(free.sigma)
-    pull = np.where(known, np.abs(fit.delta) / np.where(known, free.sigma, 1.0), 0.0)
+    pull = np.where(known, np.abs(delta) / np.where(known, free.sigma, 1.0), 0.0)
     return [int(j) for j in np.argsort(-pull) if pull[j] > CONTRADICTED][:6]
 
 
-def _widened(free: FreeParameters, j: int) -> FreeParameters:
+def widened(free: FreeParameters, j: int) -> FreeParameters:
+    """The same with a prior of parameter j that hardly holds it."""
     sigma = np.array(free.sigma)
     sigma[j] = max(WIDE * MATTERS[base_name(free.names[j])], 10.0 * sigma[j])
     return replace(free, sigma=sigma)
@@ -77,3 +79,11 @@ def _sigma(fit: Fit) -> Array:
     from tomopose.calibration.model.covariance import inverse_information
 
     return np.asarray(np.sqrt(np.diag(inverse_information(fit.N))))
+
+
+def as_stated(free: FreeParameters, against: tuple[Contradicted, ...]) -> FreeParameters:
+    """The freed parameters with the priors that were stated or assumed before any was contradicted."""
+    sigma = np.array(free.sigma)
+    for c in against:
+        sigma[free.names.index(c.name)] = c.stated
+    return replace(free, sigma=sigma)

@@ -156,7 +156,9 @@ def estimate_pose_noise(
     if most > WIDE:
         s = [_around(objective, s, k, most) for k in (0, 1)]
     L = np.array([[objective(p, w) for w in s[1]] for p in s[0]])
-    prior = np.multiply.outer(*(_prior(x, r0) for x, r0 in zip(s, (maker.t_mm, maker.w_rad), strict=True)))
+    prior = np.multiply.outer(
+        *(scatter_prior(x / max(r0, 1e-12)) for x, r0 in zip(s, (maker.t_mm, maker.w_rad), strict=True))
+    )
     weight = np.multiply.outer(*(_widths(x) for x in s)) * prior * np.exp(-0.5 * (L - L.min()))
     weight /= weight.sum()
     gain = float(L[0, 0] - L.min()) if s[0][0] == s[1][0] == 0.0 else objective(0.0, 0.0) - float(L.min())
@@ -168,8 +170,8 @@ def estimate_pose_noise(
     )
 
 
-def _prior(s: Array, maker: float) -> Array:
-    q = s / max(maker, 1e-12)
+def scatter_prior(q: Array) -> Array:
+    """Prior density of a scatter, in units of the maker's; see the module."""
     return np.asarray(1.0 / ((0.2 + q) * (1.0 + q**2) ** 2))
 
 

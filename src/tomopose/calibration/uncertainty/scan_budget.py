@@ -30,13 +30,13 @@ TILT = np.radians(5.0)
 VIEWS = 12
 
 
-def reference_scan(poses: PoseSequence) -> PoseSequence:
-    """The scan for which the first screen states an uncertainty."""
+def reference_scan(poses: PoseSequence, *, tilt: float = TILT) -> PoseSequence:
+    """The scan for which the first screen states an uncertainty; tilt: rad, 0 for a table that turns alone."""
     R = poses.T_MH.R
     if np.linalg.norm(log_rotation(R[0].T @ R), axis=1).max() > PLATFORM_RAD:
         return poses.select(np.unique(np.linspace(0, len(poses) - 1, 2 * VIEWS).round().astype(int)))
     alpha = np.linspace(0.0, 2 * np.pi, VIEWS, endpoint=False)
-    w = np.column_stack([TILT * np.sin(2 * alpha), TILT * np.cos(2 * alpha + 0.5), np.zeros(VIEWS)])
+    w = tilt * np.column_stack([np.sin(2 * alpha), np.cos(2 * alpha + 0.5), np.zeros(VIEWS)])
     T_MH = RigidTransform(
         R=exp_rotation(w), t=np.broadcast_to(poses.T_MH.t.mean(axis=0), (VIEWS, 3)), source=Frame.M, target=Frame.H
     )
@@ -79,7 +79,8 @@ def scan_budget(calibration: Calibration, problem: Problem, linear: LinearFit) -
         pose_id=problem.pose_id,
         alpha=problem.alpha,
     )
-    scan = reference_scan(own)
+    tilted = calibration.arrangement != "turntable"
+    scan = reference_scan(own, tilt=TILT if tilted else 0.0)
     scanner = calibration.scanner
     first = scanner.T_TW(float(scan.alpha[0])) @ calibration.T_HT @ scan.T_MH[0]
     x_M = first.inv.apply(field_of_view_points(scanner))
@@ -103,6 +104,7 @@ def scan_budget(calibration: Calibration, problem: Problem, linear: LinearFit) -
         measured=measured,
         shares=tuple(shares),
         two_angles=_with_two_angles(calibration, problem, linear, flat, total),
+        tilted=tilted,
     )
 
 

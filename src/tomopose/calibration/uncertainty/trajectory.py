@@ -125,7 +125,14 @@ def _columns(calibration: Calibration, poses: PoseSequence, x_M: Array) -> tuple
             column, factor = ("p_u", scanner.p_v) if name == "pitch_ratio" else (name, 1.0)
             J[..., j] = (b.J_scanner[:, :, SCANNER_COLUMNS.index(column)] * factor).reshape(n, m, 2)
     if unseen is not None:
-        of_q = unseen_columns(unseen.names, b, T_HT=calibration.T_HT, origin=T_MH.t[pose], alpha=alpha[pose])
+        of_q = unseen_columns(
+            unseen.names,
+            b,
+            T_HT=calibration.T_HT,
+            origin=T_MH.t[pose],
+            alpha=alpha[pose],
+            about_H=calibration.inverse,
+        )
         J[..., c:] = of_q.reshape(n, m, 2, -1)
     G = rigid_pose.reshape(-1, 6)
     Q, _ = np.linalg.qr(G / np.linalg.norm(G, axis=0))

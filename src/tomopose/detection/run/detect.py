@@ -131,7 +131,8 @@ def detect(
         if progress is not None:
             progress(len(rows), total)
     refuse_unusable(rows, settings.run)
-    return _observations(diameters.judged(rows, scanner, settings), ids, names, settings)
+    found = _observations(diameters.judged(rows, scanner, settings), ids, names, settings)
+    return found.with_ball_diameter(diameters.common)
 
 
 NOTHING = np.zeros((0, 0))
@@ -155,6 +156,11 @@ class _Diameters:
             self.by_ball = {0: checked_diameter(given)}
             ball_id = None
         self.ball_id = ball_id
+
+    @property
+    def common(self) -> float | None:
+        """mm, of every ball; None where they differ."""
+        return next(iter(self.by_ball.values())) if len(set(self.by_ball.values())) == 1 else None
 
     @property
     def words(self) -> str:

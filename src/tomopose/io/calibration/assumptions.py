@@ -43,6 +43,7 @@ def _budget(b: ScanBudget, cal: Calibration) -> dict[str, Any]:
         "measured_px": encode(b.measured),
         "shares_px": {name: encode(px) for name, px in b.shares},
         "two_table_angles_px": b.two_angles,
+        "tilted": b.tilted,
         "words": budget_words(b, cal.assumed),
     }
 
@@ -97,5 +98,6 @@ def from_document(document: Mapping[str, Any], m: int) -> dict[str, Any]:
             measured=number(budget["measured_px"]),
             shares=tuple((name, number(px)) for name, px in budget["shares_px"].items()),
             two_angles=None if budget["two_table_angles_px"] is None else float(budget["two_table_angles_px"]),
+            tilted=bool(budget.get("tilted", True)),
         ),
     }

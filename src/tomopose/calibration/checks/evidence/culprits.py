@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from tomopose.calibration.checks.evidence.evidence import Evidence
-from tomopose.calibration.checks.evidence.measures import Found
+from tomopose.calibration.checks.evidence.measures import Found, part_of_run
 
 
 def culprits(e: Evidence, limit: float, kinds: tuple[str, ...]) -> Iterator[Found]:
@@ -14,7 +14,7 @@ def culprits(e: Evidence, limit: float, kinds: tuple[str, ...]) -> Iterator[Foun
             yield Found(
                 value=x.evidence,
                 words=f"{x.words}: explains {x.share:.0%} of what is left (odds e^{x.evidence:.0f})",
-                remedy=f"calibrate with the poses before {x.at} alone, or with those from it on" if x.at else "",
+                remedy=part_of_run(x.at) if x.at else "",
             )
 
 

@@ -29,6 +29,14 @@ class Found:
     remedy: str = ""
 
 
+def part_of_run(pose: str) -> str:
+    """What to do where something changed at a pose."""
+    return (
+        f"calibrate with the poses before {pose} alone (--until-pose {pose}), or with those from it on "
+        f"(--from-pose {pose})"
+    )
+
+
 def _above(value: float, limit: float) -> bool:
     """NaN counts as above: what could not be calculated passes no guard."""
     return not value <= limit
@@ -117,7 +125,7 @@ def outlier_block(e: Evidence, limit: float) -> Iterator[Found]:
             value=block.p,
             words=f"{block.count} neighbouring poses, {block.first} to {block.last}, were set aside together "
             f"(p = {block.p:.1g} by chance): a step, as if the mount or the ball changed at pose {block.first}",
-            remedy=f"calibrate with the poses before {block.first} alone, or with those after it",
+            remedy=part_of_run(block.first),
         )
 
 
@@ -193,7 +201,7 @@ def effects(e: Evidence, limit: float, steps: bool) -> Iterator[Found]:
     ]
     # drifts resemble one another, and so do steps: the likeliest of each is named
     for x in sorted(moved, key=lambda x: (x.p, -x.share))[:1]:
-        yield Found(value=x.p, words=f"{x.words} (p = {x.p:.1g})")
+        yield Found(value=x.p, words=f"{x.words} (p = {x.p:.1g})", remedy=part_of_run(x.at) if x.at else "")
 
 
 def repeats(e: Evidence, limit: float, set_aside: bool) -> Iterator[Found]:
