@@ -46,9 +46,10 @@ def turntable_run(
     table: Table | None = None,
     off: dict[str, float] | None = None,
     sense: float = 1.0,
+    span: float = 2 * np.pi,
 ) -> Run:
     """A table with balls.  off: deviations of scanner values in place of drawn ones;  sense: -1 for a table whose
-    angles are told the other way round."""
+    angles are told the other way round;  span: rad, that it turns."""
     drawn = {n: s * rng.standard_normal() for n, s in {**STATED, **WIDE}.items()}
     drawn = drawn if off is None else {n: off.get(n, 0.0) for n in drawn}
     values = {n: NOMINAL.get(n, 0.0) + d for n, d in drawn.items()}
@@ -58,7 +59,7 @@ def turntable_run(
     azimuth = rng.uniform(0, 2 * np.pi, balls)
     radius = rng.uniform(6.0, 14.0, balls)
     x = np.column_stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
-    alpha = np.tile(np.linspace(0, 2 * np.pi, angles, endpoint=False), balls)
+    alpha = np.tile(np.linspace(0, span, angles, endpoint=False), balls)
     ball = np.repeat(np.arange(balls), angles)
     zero = np.zeros((len(alpha), 3))
     seen = world.image(zero, zero, alpha, x[ball][:, None, :], rng, run=False)[:, 0]

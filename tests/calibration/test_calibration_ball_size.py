@@ -11,7 +11,8 @@ from calibration_cases import BALL, MOUNT, SCANNER, mixed_poses, observe, paper_
 from scipy.spatial import ConvexHull
 
 import tomopose as tp
-from tomopose.calibration.checks.ball_size import silhouette_outlines, size_ratio
+from tomopose.calibration.checks.ball_size import size_ratio
+from tomopose.calibration.model.silhouettes import silhouette_outlines
 from tomopose.calibration.solve import calibrate
 from tomopose.errors import InputError, UnitError
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from tomopose.calibration.checks.convention_tests import FITS_SIGMAS, diagnose
+from tomopose.calibration.model.problem import pair
+from tomopose.calibration.model.silhouettes import chain_matrices, silhouette_outlines
+from tomopose.calibration.solve import calibrate
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import project_ball
 from tomopose.geometry.rotations import CONVENTIONS, rotation_from_convention
@@ -160,3 +164,24 @@ def test_tables_of_robots_declared_wrongly_are_named(shared_data, name):
     )
     assert [h.name for h in found.leading] == [NAMES[name]]
     assert found.leading[0].d_rms < 0.03
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("centimetres", 10.0), ("inches", 25.4)])
+def test_silhouettes_name_the_unit_and_clear_millimetres_of_doubt(unit, factor):
+    """With the table at one angle every scale fits; the ball's size settles it, also where the diagnosis asks."""
+    x, columns = centres(), TRUTH.as_euler("xyz", degrees=True)
+    poses = table("fanuc", columns)
+    cal = calibrate(SCANNER, poses, x, hypotheses=False)
+    P = chain_matrices(pair(SCANNER, poses, x), (cal.scanner,), cal.T_HT)
+    radius = np.sqrt(silhouette_outlines(P, np.tile(cal.t, (len(poses), 1)), 8.0))
+    seen = replace(x, semi_major=radius, semi_minor=radius, ball_diameter=8.0)
+    assert diagnose(SCANNER, poses, seen).as_declared
+    wrong = table("fanuc", columns, t=robot_poses()[1] / factor)
+    found = diagnose(SCANNER, wrong, seen)
+    assert found.other_unit is not None
+    assert found.other_unit.name == f"positions in {unit}"
+    assert not found.as_declared
+    assert "silhouettes" in found.advice[0]
+    thick = diagnose(SCANNER, poses, replace(seen, ball_diameter=8.3))
+    assert not thick.as_declared
+    assert "silhouettes" in thick.advice[0]

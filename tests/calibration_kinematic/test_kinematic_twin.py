@@ -10,6 +10,7 @@ import pytest
 from twin_cases import SCANNER, TwinExperiment, twin_experiment, twin_scan_error
 
 from tomopose import BallObservations, Calibration, projection_matrices
+from tomopose.calibration.arrangements.twin_diagnosis import diagnose_twin
 from tomopose.calibration.arrangements.twin_robots import calibrate_twin, twin_matrices, view_geometry
 from tomopose.calibration.model.twin_projection import twin_blocks, twin_view_matrices
 from tomopose.errors import InputError, NotObservableError, ShapeError
@@ -158,3 +159,16 @@ def test_wrong_calls_are_refused(twins: TwinExperiment) -> None:
         replace(e.twin, focus=[1.0, 2.0])
     with pytest.raises(InputError, match="base_t_sigma"):
         replace(e.twin, base_t_sigma=0.0)
+
+
+@pytest.mark.parametrize("whose", ["detector", "source"])
+def test_a_wrong_reading_of_either_robots_table_is_named(whose: str) -> None:
+    e = twin_experiment(ROBOT, 2, n=60, size=0.3)
+    assert diagnose_twin(e.scanner, e.poses, e.observations, twin=e.twin, mount=e.mount).as_declared
+    table = e.poses if whose == "detector" else e.twin.source_poses
+    turned = replace(table.T_MH, R=np.swapaxes(table.T_MH.R, 1, 2))
+    wrong = replace(table, T_MH=turned, orientations=None, q=None)
+    poses, twin = (wrong, e.twin) if whose == "detector" else (e.poses, replace(e.twin, source_poses=wrong))
+    found = diagnose_twin(e.scanner, poses, e.observations, twin=twin, mount=e.mount)
+    assert [h.name for h in found.leading] == [f"{whose}: rotation inverted"]
+    assert not found.as_declared

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.checks.ball_size import chain_matrices, measured_ball_size, require_ball_size
+from tomopose.calibration.checks.ball_size import measured_ball_size, require_ball_size
 from tomopose.calibration.checks.convention_tests import Diagnosis
 from tomopose.calibration.checks.evidence.evidence import AgainstRigid, BallSize, Evidence, ScatterFound
 from tomopose.calibration.checks.rules import findings
@@ -18,6 +18,7 @@ from tomopose.calibration.model.covariance import angles_by_tangent
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, unit_of
 from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.model.silhouettes import chain_matrices
 from tomopose.calibration.model.unseen import Unseen
 from tomopose.calibration.result import (
     Arrangement,

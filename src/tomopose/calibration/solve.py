@@ -34,7 +34,8 @@ from tomopose.calibration.rigid.contradiction import NOTHING_FITS, Contradicted,
 from tomopose.calibration.rigid.estimate import Solution, solve, with_pose_noise
 from tomopose.calibration.rigid.fit import blocks, linear_fit
 from tomopose.calibration.rigid.observability import observability
-from tomopose.errors import InputError, NotConvergedError
+from tomopose.errors import InputError, NotConvergedError, NotObservableError
+from tomopose.geometry.rotations import rotation_angle_between
 from tomopose.geometry.scanner import Scanner
 from tomopose.manipulator.error_models import PoseScatter, RigidErrors
 from tomopose.manipulator.poses import PoseSequence
@@ -162,6 +163,8 @@ def _tests(solution: Solution) -> ScannerTests | None:
         return None
     return scanner_tests(problem, solution.free, solution.fit)
 
+
+STILL_MM, STILL_RAD = 1e-6, 1e-9
 
 FEWEST_TESTED = 10
 """Equations beyond the unknowns that the tests need."""
@@ -297,6 +300,19 @@ def maker_of(manipulator: Any, stated: Repeatability | None) -> Repeatability | 
     return None if machine is None else machine.repeatability
 
 
+def _require_moves(problem: Problem) -> None:
+    """NotObservableError where nothing but the table moves."""
+    shifted = np.abs(problem.t_MH - problem.t_MH[0]).max()
+    turned = rotation_angle_between(problem.R_MH[0], problem.R_MH).max()
+    if shifted < STILL_MM and turned < STILL_RAD and np.ptp(problem.alpha) > 0:
+        raise NotObservableError(
+            "the manipulator has one pose throughout and only the table turns: such a set says nothing of the mount "
+            "T_HT; it determines u_0, v_0, roll and tilts of the panel and the places of the balls: --arrangement "
+            "turntable (tp.calibrate_turntable). For the mount, image the ball in poses that move and turn the plate",
+            direction="T_HT",
+        )
+
+
 def _scatter_assumed(pose_noise: str | tuple[float, float] | None, maker: Repeatability | None) -> tuple[Assumed, ...]:
     """What was assumed of the poses' scatter: the maker's repeatability, or a number that was given."""
     if pose_noise is None:
@@ -339,6 +355,7 @@ def rigid_calibration(
     """The calibration that trusts the poses, and what was freed; arguments as of `calibrate`."""
     plain = pair(scanner, poses, observations)
     require_on_panel(plain)
+    _require_moves(plain)
     no_effect = without_effect(plain.alpha, moving_scanner=arrangement == "moving-scanner")
     assumed, scanners, freed = taken_as_known(plain.scanners, free=free, fix=fix, priors=priors, no_effect=no_effect)
     problem = replace(plain, scanners=scanners)

@@ -37,7 +37,12 @@ def answer(found: Diagnosis) -> str:
     if found.leading:
         return "another convention fits: " + "; or ".join(h.words for h in found.leading)
     if not found.as_declared:
-        return "nothing fits" if found.nothing_fits else "the unit of the positions is in doubt"
+        if found.nothing_fits:
+            return "nothing fits"
+        unit = found.other_unit
+        if unit is None:
+            return "the centres fit as declared, the size of the ball does not"
+        return unit.words if unit.sized else "the unit of the positions is in doubt"
     return "the data fit as they were declared"
 
 

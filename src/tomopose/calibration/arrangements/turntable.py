@@ -21,13 +21,12 @@ from dataclasses import replace
 import numpy as np
 
 from tomopose.calibration.build import magnification_at_balls
-from tomopose.calibration.checks.ball_size import chain_matrices
 from tomopose.calibration.checks.convention_tests import Diagnosis, Hypothesis, compared, rank
 from tomopose.calibration.checks.conventions import ALTERNATIVES
 from tomopose.calibration.checks.placement import require_on_panel
 from tomopose.calibration.identified.calibrate import known_bars, pose_rows
 from tomopose.calibration.identified.fit import ModelFit, fit_model
-from tomopose.calibration.identified.map_estimate import KinematicProblem, MapEstimate, State, solve_map
+from tomopose.calibration.identified.map_estimate import KinematicProblem, MapEstimate, State, linear_at, solve_map
 from tomopose.calibration.identified.model_selection import judged
 from tomopose.calibration.identified.result import calibration_of
 from tomopose.calibration.identified.scatter import with_posterior_scatter
@@ -46,6 +45,7 @@ from tomopose.calibration.model.parameters import (
     unit_of,
 )
 from tomopose.calibration.model.problem import Problem, pair
+from tomopose.calibration.model.silhouettes import chain_matrices
 from tomopose.calibration.model.twin_projection import balls_from_rays
 from tomopose.calibration.result import Calibration
 from tomopose.calibration.solve import freed_names
@@ -139,9 +139,11 @@ def calibrate_turntable(
         mount_known=True,
     )
     fit = _fitted(problem, robust=robust, widen=auto)
-    _require_determined(fit)
+    own = _hypothesis(fit.estimate, "declared", "the data as declared", "", "declared")
+    if own.fits:
+        _require_determined(fit)
     chosen = with_posterior_scatter(fit)
-    diagnosis = _diagnosis(fit) if hypotheses else None
+    diagnosis = _diagnosis(fit, own) if hypotheses else None
     e = chosen.estimate
     found = calibration_of(
         {"rigid": chosen},
@@ -211,9 +213,8 @@ def _require_determined(fit: ModelFit) -> None:
             )
 
 
-def _diagnosis(fit: ModelFit) -> Diagnosis:
+def _diagnosis(fit: ModelFit, own: Hypothesis) -> Diagnosis:
     """The declared reading against the other sense of the table, other images and a lag."""
-    own = _hypothesis(fit.estimate, "declared", "the data as declared", "", "declared")
     found = [own]
     whole = replace(fit.whole, scatter=1.0)
     for alternative in ALTERNATIVES:
@@ -236,17 +237,19 @@ def _rows_of(poses: PoseSequence, data: Problem) -> PoseSequence:
 
 
 def _hypothesis(e: MapEstimate, name: str, words: str, remedy: str, outcome: str) -> Hypothesis:
-    r = e.at.r
-    x = e.problem.data.x_D
+    # by the sigmas as they were stated: scatter that was raised until it explains everything explains nothing
+    at = linear_at(replace(e.problem, scatter=1.0), e.state)
+    r, x = at.r, e.problem.data.x_D
+    chi2 = float((at.r_white**2).sum() + (at.prior_residuals**2).sum())
     d_rms = float(np.sqrt((r**2).sum(axis=1).mean()))
     return Hypothesis(
         name=name,
         words=words,
         remedy=remedy,
         d_rms=d_rms,
-        chi2=e.chi2,
+        chi2=chi2,
         dof=e.dof,
-        sigmas=float(np.sqrt(e.chi2 / max(e.dof, 1))),
+        sigmas=float(np.sqrt(chi2 / max(e.dof, 1))),
         delta=0.0,
         factor=1.0,
         outcome=outcome,

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from tomopose.calibration.arrangements.twin_robots import calibrate_twin
+from tomopose.calibration.arrangements.twin_robots import trusted_problem
 from tomopose.calibration.checks.alternative import Alternative
 from tomopose.calibration.checks.convention_tests import Diagnosis, Hypothesis, compared, rank
 from tomopose.calibration.checks.conventions import ALTERNATIVES
+from tomopose.calibration.identified.map_estimate import STEPS, MapEstimate, solve_map
 from tomopose.calibration.model.problem import Problem, pair
-from tomopose.calibration.result import Calibration
 from tomopose.errors import TomoposeError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.scanner import Scanner
@@ -23,6 +23,9 @@ from tomopose.observations import BallObservations
 
 OF_TABLES = ("table sign", "table zero", "image turned by 180 degrees and table sign")
 """Readings of a rotary table, which twin robots do not have."""
+
+FEW_STEPS = 25
+"""Steps after which a reading that has found no optimum is given up; the right one takes less than ten."""
 
 
 def diagnose_twin(
@@ -37,49 +40,46 @@ def diagnose_twin(
 ) -> Diagnosis:
     """Rank alternative conventions of both robots' tables and of the images; arguments as of `calibrate_twin`.
 
-    Of the list in `conventions` the quick ones are tried: each is a fit of both robots, which takes a second.  Both
-    robots are trusted (model "rigid").  Raises what `calibrate_twin` raises for the declared reading, but
-    NotConvergedError.
+    Of the list in `conventions` the quick ones are tried, each by a fit of both robots as trusted ones (model "rigid").
+    Raises what `calibrate_twin` raises for the declared reading.
     """
 
-    def fitted(own: PoseSequence, seen: BallObservations, robots: TwinRobots) -> Calibration | None:
+    def fitted(own: PoseSequence, seen: BallObservations, robots: TwinRobots, *, steps: int) -> MapEstimate:
+        problem, start, _ = trusted_problem(scanner, own, seen, twin=robots, mount=mount, free=free, fix=fix)
+        return solve_map(problem, start, steps=steps)
+
+    declared = _hypothesis(
+        fitted(poses, observations, twin, steps=STEPS),
+        Alternative(name="declared", words="the data as declared", remedy="", change=lambda p: p),
+        "declared",
+    )
+    found = [declared]
+    for alternative, of_poses, seen, robots in _readings(scanner, poses, observations, twin):
         try:
-            return calibrate_twin(
-                scanner, own, seen, twin=robots, mount=mount, model="rigid", robust=False, free=free, fix=fix
-            )
+            other = fitted(of_poses, seen, robots, steps=FEW_STEPS)
         except (TomoposeError, np.linalg.LinAlgError):
             # a wrong reading may lead anywhere; one that cannot be fitted is not the right one
-            return None
-
-    bare = replace(observations, ball_diameter=None)
-    declared = calibrate_twin(
-        scanner, poses, bare, twin=twin, mount=mount, model="rigid", robust=False, free=free, fix=fix
-    )
-    own = _hypothesis(declared, name="declared", words="the data as declared", remedy="", outcome="declared")
-    found = [own]
-    for alternative, of_poses, seen, robots in _readings(scanner, poses, bare, twin):
-        other = fitted(of_poses, seen, robots)
-        if other is not None and np.isfinite(other.chi2) and other.dof > 0:
-            one = _hypothesis(
-                other, name=alternative.name, words=alternative.words, remedy=alternative.remedy, outcome="worse"
-            )
-            found.append(compared(own, one))
+            continue
+        if np.isfinite(other.chi2) and other.dof > 0:
+            found.append(compared(declared, _hypothesis(other, alternative, "worse")))
     return Diagnosis(hypotheses=rank(found))
 
 
-def _hypothesis(cal: Calibration, *, name: str, words: str, remedy: str, outcome: str) -> Hypothesis:
+def _hypothesis(e: MapEstimate, reading: Alternative, outcome: str) -> Hypothesis:
+    r, x = e.at.r, e.problem.data.x_D
+    d_rms = float(np.sqrt((r**2).sum(axis=1).mean()))
     return Hypothesis(
-        name=name,
-        words=words,
-        remedy=remedy,
-        d_rms=cal.d_rms,
-        chi2=cal.chi2,
-        dof=cal.dof,
-        sigmas=float(np.sqrt(cal.chi2_dof)),
+        name=reading.name,
+        words=reading.words,
+        remedy=reading.remedy,
+        d_rms=d_rms,
+        chi2=e.chi2,
+        dof=e.dof,
+        sigmas=float(np.sqrt(e.chi2 / e.dof)),
         delta=0.0,
         factor=1.0,
         outcome=outcome,
-        share=cal.d_rms / float(np.sqrt(((cal.x_D - cal.x_D.mean(axis=0)) ** 2).sum(axis=1).mean())),
+        share=d_rms / float(np.sqrt(((x - x.mean(axis=0)) ** 2).sum(axis=1).mean())),
     )
 
 

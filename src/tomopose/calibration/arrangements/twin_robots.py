@@ -15,7 +15,7 @@ from tomopose.calibration.identified.model_selection import better, judged
 from tomopose.calibration.identified.result import calibration_of
 from tomopose.calibration.identified.scale_bars import require_balls_not_swapped
 from tomopose.calibration.identified.scatter import with_posterior_scatter
-from tomopose.calibration.model.assumed import assumed_for, scatter_assumed, with_assumed
+from tomopose.calibration.model.assumed import Assumed, assumed_for, scatter_assumed, with_assumed
 from tomopose.calibration.model.parameters import MATTERS, UNITS, FreeParameters, free_parameters, unit_of
 from tomopose.calibration.model.problem import pair
 from tomopose.calibration.model.twin_projection import balls_from_rays, twin_view_matrices
@@ -101,39 +101,17 @@ def calibrate_twin(
     """
     if model not in MODELS:
         raise InputError(f"unknown model {model!r}; known are {', '.join(MODELS)}")
-    if np.asarray(poses.alpha).any():
-        raise InputError("the arrangement with a fixed object has no rotary table; alpha must be 0 in every pose")
     free, auto = freed_names(free)
-    others = [name for name in PARAMETER_UNITS if name not in PANEL]
-    assumed = assumed_for(scanner, free=free, fix=fix, priors=dict(priors or {}), no_effect=others)
-    freed = panel_parameters(with_assumed(scanner, assumed), free=free, fix=fix, priors=priors)
-    turned = inverse_poses(poses)
-    data = pair(scanner, turned, observations)
-    _require_both_tables(data.pose_id, twin.source_poses)
-    rows = turned.select(data.index)
-    T_HT = mount.require(Frame.H, Frame.T)
-    if balls is None:
-        trusted = twin.trusted()
-        P = twin_view_matrices(scanner, trusted, T_HT=T_HT, poses=rows, p=np.zeros(len(trusted.names)))
-        places = balls_from_rays(P, data.x_D, data.ball, len(data.ball_ids))
-    else:
-        missing = [i for i in data.ball_ids if i not in balls]
-        if missing:
-            raise InputError(f"a start is needed for every ball; ball {missing[0]} has none")
-        places = np.array([np.asarray(balls[i], float) for i in data.ball_ids])
+    trusted, start, assumed = trusted_problem(
+        scanner, poses, observations, twin=twin, mount=mount, balls=balls, free=free, fix=fix, priors=priors
+    )
+    trusted = replace(trusted, bars=known_bars(distances, trusted.data))
+    data = trusted.data
     fits: dict[str, ModelFit] = {}
-    start = State(T_HT=T_HT, balls=places, delta=np.zeros(len(freed)), p=np.zeros(9))
     for name, machines in (("rigid", twin.trusted()), ("kinematic", twin)):
         if name == "kinematic" and model == "rigid":
             continue
-        problem = KinematicProblem(
-            data=data,
-            poses=rows,
-            free=freed,
-            model=machines,
-            repeatability=machines.repeatability,
-            bars=known_bars(distances, data),
-        )
+        problem = replace(trusted, model=machines, repeatability=machines.repeatability)
         begin = replace(start, p=np.concatenate([np.zeros(len(machines.names) - 9), start.p]))
         fits[name] = fit_model(problem, begin, robust=robust and name == "kinematic", widen=auto)
         start = fits[name].estimate.state
@@ -158,6 +136,43 @@ def calibrate_twin(
         source_poses=twin.source_poses.select(twin.source_poses.index_of(data.pose_id)),
         provenance=provenance(arguments={"model": model}),
     )
+
+
+def trusted_problem(
+    scanner: Scanner,
+    poses: PoseSequence,
+    observations: BallObservations,
+    *,
+    twin: TwinRobots,
+    mount: RigidTransform,
+    balls: Mapping[int, Array] | None = None,
+    free: Sequence[str] = (),
+    fix: Sequence[str] = (),
+    priors: Mapping[str, float] | None = None,
+) -> tuple[KinematicProblem, State, tuple[Assumed, ...]]:
+    """(problem with both robots trusted, its start, what was assumed of the scanner); arguments as `calibrate_twin`."""
+    if np.asarray(poses.alpha).any():
+        raise InputError("the arrangement with a fixed object has no rotary table; alpha must be 0 in every pose")
+    others = [name for name in PARAMETER_UNITS if name not in PANEL]
+    assumed = assumed_for(scanner, free=free, fix=fix, priors=dict(priors or {}), no_effect=others)
+    freed = panel_parameters(with_assumed(scanner, assumed), free=free, fix=fix, priors=priors)
+    turned = inverse_poses(poses)
+    data = pair(scanner, turned, observations)
+    _require_both_tables(data.pose_id, twin.source_poses)
+    rows = turned.select(data.index)
+    T_HT = mount.require(Frame.H, Frame.T)
+    trusted = twin.trusted()
+    if balls is None:
+        P = twin_view_matrices(scanner, trusted, T_HT=T_HT, poses=rows, p=np.zeros(len(trusted.names)))
+        places = balls_from_rays(P, data.x_D, data.ball, len(data.ball_ids))
+    else:
+        missing = [i for i in data.ball_ids if i not in balls]
+        if missing:
+            raise InputError(f"a start is needed for every ball; ball {missing[0]} has none")
+        places = np.array([np.asarray(balls[i], float) for i in data.ball_ids])
+    problem = KinematicProblem(data=data, poses=rows, free=freed, model=trusted, repeatability=trusted.repeatability)
+    start = State(T_HT=T_HT, balls=places, delta=np.zeros(len(freed)), p=np.zeros(len(trusted.names)))
+    return problem, start, assumed
 
 
 def _view_matrices(fit: ModelFit) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 
 from tomopose.calibration.checks.evidence.evidence import BallSize
 from tomopose.calibration.model.problem import POSITION_UNITS, Problem, pair
+from tomopose.calibration.model.silhouettes import chain_matrices, size_ratio_of
 from tomopose.errors import InputError, UnitError
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
@@ -42,51 +43,20 @@ class Placed(Protocol):
     def pose_id(self) -> tuple[str, ...]: ...
 
 
-def chain_matrices(problem: Problem, scanners: tuple[Scanner, ...], T_HT: RigidTransform) -> Array:
-    """(n, 3, 4): from the moved plate M to pixels, of every row's pose as reported."""
-    T_MH = np.zeros((len(problem), 4, 4))
-    T_MH[:, :3, :3], T_MH[:, :3, 3], T_MH[:, 3, 3] = problem.R_MH, problem.t_MH, 1.0
-    P = np.empty((len(problem), 3, 4))
-    for r, scanner in enumerate(scanners):
-        mine = problem.run == r
-        P[mine] = scanner.P_S @ scanner.T_WS.matrix @ scanner.T_TW(problem.alpha[mine]).matrix
-    return P @ T_HT.matrix @ T_MH
-
-
-def silhouette_outlines(P: Array, centres: Array, diameter: float) -> Array:
-    """(n,) px^2: product of the semi axes of the silhouettes of balls at centres (n, 3), under P (n, 3, 4).
-
-    The dual quadric of a sphere, x x^T - r^2 diag(1, 1, 1, 0), has the dual conic P Q P^T as its outline (Hartley and
-    Zisserman, Multiple View Geometry, sec. 8.3), which gives the ellipse's centre and shape.
-    """
-    x = np.concatenate([centres, np.ones((len(centres), 1))], axis=1)
-    Q = x[:, :, None] * x[:, None, :]
-    Q[:, range(3), range(3)] -= (diameter / 2.0) ** 2
-    C = P @ Q @ np.swapaxes(P, 1, 2)
-    C = C / C[:, 2:, 2:]
-    m = C[:, :2, 2]
-    return np.sqrt(np.maximum(np.linalg.det(m[:, :, None] * m[:, None, :] - C[:, :2, :2]), 0.0))
-
-
 def measured_ball_size(problem: Problem, P: Array, centres: Array) -> BallSize | None:
     """The gauge of rows whose outline was measured; None without outlines or without the ball's diameter.
 
     P (n, 3, 4): from the balls' frame to pixels;  centres (n, 3): of the ball of each row.
     """
-    outline, diameter = problem.outline, problem.ball_diameter
-    if outline is None or diameter is None:
-        return None
-    known = np.isfinite(outline)
-    if not known.any():
+    diameter = problem.ball_diameter
+    own = size_ratio_of(problem, P, centres)
+    if diameter is None or own is None:
         return None
 
     def ratio(factor: float) -> float:
         # a scene in another unit throws the silhouettes of a ball that is smaller by this factor
-        calculated = silhouette_outlines(P[known], centres[known], diameter / factor)
-        with np.errstate(divide="ignore"):
-            return float(np.sqrt(np.median(outline[known] / calculated)))
+        return size_ratio_of(problem, P, centres, diameter / factor) or np.nan
 
-    own = ratio(1.0)
     agreeing = (u for u in POSITION_UNITS if abs(ratio(u[2]) - 1.0) < UNIT_TOLERANCE)
     unit = None if abs(own - 1.0) <= WRONG else next(agreeing, None)
     return BallSize(ratio=own, diameter=diameter, unit=unit)

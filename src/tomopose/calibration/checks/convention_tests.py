@@ -23,8 +23,9 @@ from tomopose.calibration.checks.alternative import Alternative
 from tomopose.calibration.checks.conventions import ALTERNATIVES, ALTERNATIVES_OF_MOVING_SCANNER
 from tomopose.calibration.checks.placement import Placement, beams, better_placed, placement
 from tomopose.calibration.checks.stability import SIGNIFICANT, Effect, chi2_with_movements, movements
-from tomopose.calibration.model.parameters import UNITS, FreeParameters, free_parameters
+from tomopose.calibration.model.parameters import UNITS, FreeParameters, adjusted_scanners, free_parameters
 from tomopose.calibration.model.problem import Problem, pair
+from tomopose.calibration.model.silhouettes import chain_matrices, size_ratio_of
 from tomopose.calibration.rigid.estimate import best_fit
 from tomopose.calibration.rigid.fit import Fit, minimise, residuals, whitened2
 from tomopose.calibration.rigid.start import Rays, closed_form, other_starts, ray_equations, turned_about_beam
@@ -58,6 +59,9 @@ SMALL_SHARE, DECISIVE = 0.02, 100.0
 SMALL_SHARE of the centres' spread (robots and hexapods with nominal geometry leave 0.004 to 0.009, wrong readings of
 robots' tables 0.2 to 0.7), and chi2 lowered by the factor DECISIVE, that is, residuals ten times smaller."""
 
+WRONG_SIZE = 0.02
+"""Difference of the silhouettes' size from which a reading is contradicted: two pixels at a radius of 100 px."""
+
 ITERATIONS = 20
 """An alternative that is right needs fewer; one that is wrong is not worth more."""
 
@@ -89,7 +93,8 @@ class Hypothesis:
     alternative's, both floored at dof;  outcome: declared | better | same | worse | unfit;  symmetry: no plan could
     distinguish it;  length_factor: of `Alternative`;  ball_mm: distance of the ball from the focal spot, median;
     d_SR: of the scanner, mm;  possible: every ball is between focal spot and panel;
-    share: d_rms over the spread of the centres.
+    share: d_rms over the spread of the centres;  size_ratio: measured size of the balls' silhouettes over that which
+    this reading calculates; NaN where no outline or no diameter is known.
     """
 
     name: str
@@ -108,6 +113,12 @@ class Hypothesis:
     d_SR: float = 0.0
     possible: bool = True
     share: float = 0.0
+    size_ratio: float = float("nan")
+
+    @property
+    def sized(self) -> bool | None:
+        """Whether the silhouettes have the size that this reading calculates; None where that is not known."""
+        return None if np.isnan(self.size_ratio) else abs(self.size_ratio - 1.0) <= WRONG_SIZE
 
     @property
     def off_axis(self) -> float:
@@ -138,6 +149,7 @@ class Hypothesis:
             "d_SR_mm": self.d_SR,
             "possible": self.possible,
             "share": self.share,
+            "size_ratio": None if np.isnan(self.size_ratio) else self.size_ratio,
         }
 
 
@@ -168,8 +180,11 @@ class Diagnosis:
 
     @property
     def other_unit(self) -> Hypothesis | None:
-        """The unit of the positions that fits as well as millimetres and places the ball where a scanner has it."""
-        units = [h for h in self.same if h.length_factor != 1.0]
+        """The unit of the positions that fits as well as millimetres and places the ball where a scanner has it; with
+        silhouettes, the one whose balls have their size."""
+        units = [h for h in self.same if h.length_factor != 1.0 and h.sized is not False]
+        if self.declared.sized:
+            return None
         return min(units, key=lambda h: h.off_axis, default=None)
 
     @property
@@ -180,7 +195,8 @@ class Diagnosis:
     @property
     def as_declared(self) -> bool:
         """Whether the declared reading fits and no alternative fits better or is likelier."""
-        return not self.better and self.declared.fits and self.other_unit is None
+        sized = self.declared.sized is not False
+        return not self.better and self.declared.fits and self.other_unit is None and sized
 
     @property
     def leading(self) -> tuple[Hypothesis, ...]:
@@ -214,6 +230,8 @@ class Diagnosis:
         if not lines:
             if self.other_unit is not None:
                 lines.append(other_unit_words(self.other_unit, self.declared))
+            elif self.declared.sized is False:
+                lines.append(wrong_size_words(self.declared.size_ratio))
             alike = [h.name for h in self.same if not h.symmetry and h.length_factor == 1.0]
             if alike:
                 lines.append(f"cannot be distinguished with these poses: {', '.join(alike)}")
@@ -225,12 +243,35 @@ class Diagnosis:
 
 def other_unit_words(h: Hypothesis, declared: Hypothesis) -> str:
     """Why another unit of the positions is the likelier one, and what would settle it."""
+    if h.sized:
+        return (
+            f"{h.words}: fits as well, and the balls' silhouettes then have the size of their diameter (ratio "
+            f"{h.size_ratio:.3f}), where with millimetres it is {declared.size_ratio:.3g}; to try: {h.remedy}"
+        )
     return (
         f"{h.words}: fits as well, and places the ball {h.ball_mm:.4g} mm from the focal spot, nearer to the rotation "
         f"axis, where millimetres place it at {declared.ball_mm:.4g} mm; to try: {h.remedy}. The ball's diameter with "
         "the outlines' semi axes, or another table angle, settles it; '# units: confirmed' in poses.csv says that they "
         "are millimetres"
     )
+
+
+def wrong_size_words(ratio: float) -> str:
+    """The silhouettes contradict the declared reading, and no other unit agrees with them."""
+    return (
+        f"the centres fit as declared, but the balls' silhouettes have {ratio:.3g} times the size that a ball of the "
+        "stated diameter would throw from where this places it; the diameter (--ball-diameter-mm), the scale of the "
+        "poses' translations or d_SD, d_SR and the pitches in scanner.json are wrong"
+    )
+
+
+def _size_ratio(problem: Problem, free: FreeParameters, fit: Fit) -> float:
+    """Measured size of the silhouettes over the calculated one; NaN where it is not known or cannot be calculated."""
+    if problem.outline is None or problem.ball_diameter is None or not np.isfinite(fit.chi2):
+        return float("nan")
+    P = chain_matrices(problem, adjusted_scanners(problem.scanners, free, fit.delta), fit.T_HT)
+    found = size_ratio_of(problem, P, fit.t[problem.ball])
+    return float("nan") if found is None else found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -340,6 +381,7 @@ class _Declared:
             d_SR=self.placed.d_SR,
             possible=self.placed.possible,
             share=left.share,
+            size_ratio=_size_ratio(self.problem, self.free, self.fit),
         )
 
 
@@ -453,6 +495,7 @@ def _judged(
             d_SR=placed.d_SR,
             possible=placed.possible,
             share=left.share,
+            size_ratio=_size_ratio(changed, free, other),
         ),
     )
     likelier = better_placed(placed, declared.placed) and not changed.units_confirmed

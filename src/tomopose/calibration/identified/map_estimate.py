@@ -288,8 +288,8 @@ def _factor(J: Array, damping: float = 0.0) -> tuple[Array, Array] | None:
         return None
 
 
-def solve_map(problem: KinematicProblem, start: State) -> MapEstimate:
-    """Levenberg-Marquardt from `start`, the weights renewed at every step.
+def solve_map(problem: KinematicProblem, start: State, *, steps: int = STEPS) -> MapEstimate:
+    """Levenberg-Marquardt from `start`, the weights renewed at every step, of which there are at most `steps`.
 
     Raises NotConvergedError where no optimum is reached.
     """
@@ -297,7 +297,7 @@ def solve_map(problem: KinematicProblem, start: State) -> MapEstimate:
     r, J, at, W = _weighted(problem, state)
     if not np.isfinite(r).all():
         raise NotConvergedError("at the start a ball lies behind the source; the start is too far off")
-    for step in range(1, STEPS + 1):
+    for step in range(1, steps + 1):
         while True:
             factor = _factor(J, damping)
             drop = -np.inf
@@ -321,8 +321,8 @@ def solve_map(problem: KinematicProblem, start: State) -> MapEstimate:
             return _estimate(problem, state, r, J, at, step)
         damping = damping / 10 if damping > LEAST_DAMPING else 0.0
     if abs(drop) < VALLEY_TOLERANCE * len(r):
-        return _estimate(problem, state, r, J, at, STEPS)
-    raise NotConvergedError(f"no optimum after {STEPS} steps; the last one still gained {drop:.3g} in chi2")
+        return _estimate(problem, state, r, J, at, steps)
+    raise NotConvergedError(f"no optimum after {steps} steps; the last one still gained {drop:.3g} in chi2")
 
 
 def _reweighted(problem: KinematicProblem, r: Array, J: Array, at: Linearised, W: Array) -> tuple[Array, Array]:

@@ -74,6 +74,7 @@ def hypothesis_from(row: Mapping[str, Any]) -> Hypothesis:
         d_SR=number(row.get("d_SR_mm", 0.0)),
         possible=bool(row.get("possible", True)),
         share=number(row.get("share", 0.0)),
+        size_ratio=number(row.get("size_ratio")),
     )
 
 

@@ -1,0 +1,53 @@
+"""How large the silhouettes of balls should be, and how large they are: a gauge that the centres do not hold."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tomopose.calibration.model.problem import Problem
+from tomopose.geometry.scanner import Scanner
+from tomopose.geometry.transforms import RigidTransform
+from tomopose.units import Array
+
+
+def chain_matrices(problem: Problem, scanners: tuple[Scanner, ...], T_HT: RigidTransform) -> Array:
+    """(n, 3, 4): from the moved plate M to pixels, of every row's pose as reported."""
+    T_MH = np.zeros((len(problem), 4, 4))
+    T_MH[:, :3, :3], T_MH[:, :3, 3], T_MH[:, 3, 3] = problem.R_MH, problem.t_MH, 1.0
+    P = np.empty((len(problem), 3, 4))
+    for r, scanner in enumerate(scanners):
+        mine = problem.run == r
+        P[mine] = scanner.P_S @ scanner.T_WS.matrix @ scanner.T_TW(problem.alpha[mine]).matrix
+    return P @ T_HT.matrix @ T_MH
+
+
+def silhouette_outlines(P: Array, centres: Array, diameter: float) -> Array:
+    """(n,) px^2: product of the semi axes of the silhouettes of balls at centres (n, 3), under P (n, 3, 4).
+
+    The dual quadric of a sphere, x x^T - r^2 diag(1, 1, 1, 0), has the dual conic P Q P^T as its outline (Hartley and
+    Zisserman, Multiple View Geometry, sec. 8.3), which gives the ellipse's centre and shape.
+    """
+    x = np.concatenate([centres, np.ones((len(centres), 1))], axis=1)
+    Q = x[:, :, None] * x[:, None, :]
+    Q[:, range(3), range(3)] -= (diameter / 2.0) ** 2
+    C = P @ Q @ np.swapaxes(P, 1, 2)
+    C = C / C[:, 2:, 2:]
+    m = C[:, :2, 2]
+    return np.sqrt(np.maximum(np.linalg.det(m[:, :, None] * m[:, None, :] - C[:, :2, :2]), 0.0))
+
+
+def size_ratio_of(problem: Problem, P: Array, centres: Array, diameter: float | None = None) -> float | None:
+    """Median over the rows of the measured size of the silhouette over the calculated one.
+
+    P (n, 3, 4): from the balls' frame to pixels;  centres (n, 3): of the ball of each row;  diameter: mm, in place of
+    the problem's own.  None without outlines or without a diameter.
+    """
+    diameter = problem.ball_diameter if diameter is None else diameter
+    if problem.outline is None or diameter is None:
+        return None
+    known = np.isfinite(problem.outline)
+    if not known.any():
+        return None
+    calculated = silhouette_outlines(P[known], centres[known], diameter)
+    with np.errstate(divide="ignore"):
+        return float(np.sqrt(np.median(problem.outline[known] / calculated)))
