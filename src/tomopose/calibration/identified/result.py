@@ -22,7 +22,7 @@ from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import translation_scale
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.model.unseen import Unseen, unseen_of
-from tomopose.calibration.result import Arrangement, Calibration, ModelComparison, ModelJudgement, ViewDistances
+from tomopose.calibration.result import Arrangement, Calibration, ModelComparison, ModelJudgement
 from tomopose.calibration.rigid.contradiction import NOTHING_FITS
 from tomopose.calibration.rigid.observability import Observability
 from tomopose.manipulator.error_models import (
@@ -171,7 +171,6 @@ def calibration_of(
     diagnosis: Diagnosis | None = None,
     assumed: tuple[Assumed, ...] = (),
     source_poses: PoseSequence | None = None,
-    views: ViewDistances | None = None,
     view_matrices: Array | None = None,
     provenance: Provenance | None = None,
 ) -> Calibration:
@@ -213,7 +212,6 @@ def calibration_of(
             manipulator=_manipulator_evidence(fit, judged, chosen, asked),
             diagnosis=diagnosis,
             comparison=comparison(judged, fits, chosen),
-            views=views,
             magnification_at_ball=magnification_at_ball,
             view_matrices=view_matrices,
             assumed=assumed,
