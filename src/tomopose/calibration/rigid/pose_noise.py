@@ -179,7 +179,7 @@ def expected_scatter(maker: Repeatability | None = None) -> PoseNoise:
     """Root mean of the prior: the scatter that is assumed before an image is taken; maker: default as above."""
     maker = Repeatability() if maker is None else maker
     q = np.concatenate([[0.0], np.geomspace(1e-4, 100.0, 600)])
-    weight = _prior(q, 1.0) * _widths(q)
+    weight = scatter_prior(q) * _widths(q)
     times = math.sqrt(float((weight * q**2).sum() / weight.sum()))
     return PoseNoise(translation=times * maker.t_mm, rotation=times * maker.w_rad, found=False)
 
