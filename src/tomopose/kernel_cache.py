@@ -11,7 +11,7 @@ import os
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 VARIABLE = "NUMBA_CACHE_DIR"
@@ -29,6 +29,14 @@ def choose_cache_folder(package: Path, environment: Mapping[str, str] = os.envir
             return
     os.environ.pop(VARIABLE, None)
     compile_each_time()
+
+
+def kept_in(package: Path, environment: Mapping[str, str] = os.environ) -> Path | None:
+    """The folder that compiled kernels are kept in, after `choose_cache_folder`; None where nothing is kept."""
+    named = environment.get(VARIABLE)
+    if named:
+        return Path(named)
+    return package / "__pycache__" if _writable(package) else None
 
 
 def candidates(environment: Mapping[str, str]) -> Iterator[Path]:
@@ -80,3 +88,33 @@ def compile_each_time() -> None:
     from numba.core.dispatcher import Dispatcher
 
     setattr(Dispatcher, "enable_caching", lambda self: None)  # noqa: B010  (a method is replaced)
+
+
+@contextlib.contextmanager
+def told_of_compiling(told: Callable[[bool], None]) -> Iterator[None]:
+    """Calls told(True) when this process begins to compile a kernel and told(False) when it ends; not for kernels that
+    are loaded from the cache.
+    """
+    from numba.core.event import Event, Listener, register, unregister
+
+    class Compiling(Listener):
+        """Kernels that call others are compiled one inside the other: only the outermost counts."""
+
+        depth = 0
+
+        def on_start(self, event: Event) -> None:
+            self.depth += 1
+            if self.depth == 1:
+                told(True)
+
+        def on_end(self, event: Event) -> None:
+            self.depth -= 1
+            if self.depth == 0:
+                told(False)
+
+    listener = Compiling()
+    register("numba:compile", listener)
+    try:
+        yield
+    finally:
+        unregister("numba:compile", listener)

@@ -108,7 +108,7 @@ class Say:
         elif sys.stderr.isatty():
             yield from _bar(label)
         else:
-            yield _lines(label)
+            yield from _lines(label)
 
 
 def _bar(label: str) -> Iterator[Progress]:
@@ -116,8 +116,10 @@ def _bar(label: str) -> Iterator[Progress]:
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as RichProgress
 
+    from tomopose.kernel_cache import told_of_compiling
+
     columns = (
-        TextColumn(label),
+        TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
@@ -126,12 +128,25 @@ def _bar(label: str) -> Iterator[Progress]:
     )
     with RichProgress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(label, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+        def compiling(now: bool) -> None:
+            bar.update(task, description="compiling" if now else label)
+
+        with told_of_compiling(compiling):
+            yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def _lines(label: str) -> Progress:
+def _lines(label: str) -> Iterator[Progress]:
+    from tomopose.kernel_cache import told_of_compiling
+
     start = time.monotonic()
-    said = -1
+    said, told = -1, False
+
+    def compiling(now: bool) -> None:
+        nonlocal told
+        if not told:
+            told = True
+            tell(f"{label}: compiling what this command needs, once for this installation")
 
     def update(done: int, total: int) -> None:
         nonlocal said
@@ -142,7 +157,8 @@ def _lines(label: str) -> Progress:
             left = f", {elapsed * (total - done) / done:.0f} s left" if 0 < done < total else ""
             tell(f"{label}: {done} of {total}{left}")
 
-    return update
+    with told_of_compiling(compiling):
+        yield update
 
 
 def either(images: str | None, observations: Path | None) -> None:

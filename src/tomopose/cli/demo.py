@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -43,7 +42,8 @@ def demo(
     from tomopose.files import require_absent
     from tomopose.geometry.rotations import rotation_angle_between
     from tomopose.provenance import provenance
-    from tomopose.studies.demo import demo_setup, rehearse
+    from tomopose.studies.demo import demo_setup
+    from tomopose.studies.warmup import compiled_while
 
     say = Say(json=as_json, quiet=quiet)
     for name in ("calibration.json", "scan.csv", "matrices.npz", "scanner.json"):
@@ -58,10 +58,8 @@ def demo(
         snr=setup.snr,
         seed=setup.seed,
     )
-    with say.progress("simulating") as progress, ThreadPoolExecutor(max_workers=1) as beside:
-        rehearsal = beside.submit(rehearse, setup)
+    with say.progress("simulating") as progress, compiled_while("simulate", beside=("detect", "calibrate")):
         write_run(out, run, workers=workers, force=force, progress=progress)
-        rehearsal.result()
 
     # From here on as with one's own data: only what the files say is used.
     scanner, poses = tp.read_scanner(out / "scanner.json"), tp.read_poses(out / "poses.csv")

@@ -20,6 +20,7 @@ EXTRAS = {
     "metrology": ("vtk", "scikit-image", "cmcrameri", "matplotlib"),
     "sim": ("spekpy", "xraydb", "embreex", "trimesh", "manifold3d"),
     "gvxr": ("gvxr",),
+    "zeiss": ("olefile",),
     "step": ("cascadio",),
     "dask": ("dask", "distributed"),
 }
@@ -47,7 +48,9 @@ def register(app: typer.Typer) -> None:
 def doctor(as_json: JsonOption = False, quiet: QuietOption = False) -> int:
     """Say which engines and extras are found, their versions, and how to install what is missing."""
     from tomopose.provenance import package_version
+    from tomopose.studies.warmup import JOBS, compiled_jobs
 
+    compiled = compiled_jobs()
     extras: dict[str, dict[str, Any]] = {
         extra: {
             "packages": {name: package_version(name) for name in packages},
@@ -72,6 +75,7 @@ def doctor(as_json: JsonOption = False, quiet: QuietOption = False) -> int:
         "core": {name: package_version(name) for name in CORE},
         "extras": extras,
         "engines": engines,
+        "compiled": {name: name in compiled for name in JOBS},
         "browser": next((b for b in BROWSERS if shutil.which(b)), None),
     }
     lines = [f"tomopose {package_version()}, Python {platform.python_version()}, {os.cpu_count()} processors"]
@@ -79,5 +83,12 @@ def doctor(as_json: JsonOption = False, quiet: QuietOption = False) -> int:
         state = "complete" if found["complete"] else f"incomplete; {found['install']}"
         lines.append(f"  [{extra}] {state}: " + ", ".join(f"{k} {v}" for k, v in found["packages"].items()))
     lines += [f"  engine {name}: {state}" for name, state in engines.items()]
+    left = [name for name in JOBS if name not in compiled]
+    lines.append(
+        f"  kernels of {', '.join(left)} are not compiled yet; tomopose warmup does it, or the first command that "
+        "needs them"
+        if left
+        else "  kernels are compiled"
+    )
     Say(json=as_json, quiet=quiet).result(summary, lines)
     return OK

@@ -55,6 +55,7 @@ VERBS = (
     "monitor",
     "report",
     "study",
+    "warmup",
     "doctor",
 )
 """The modules of this folder that hold a verb each, in the order of --help; each has `register(app)`."""

@@ -7,16 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tomopose.geometry.frames import Frame
-from tomopose.geometry.projection import project_ball
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.observations import BallObservations
 from tomopose.units import Array
 
 SMALL_BINNING = 4
 DEMO_SEED = 2023
-REHEARSAL_PX = 128
 BACKGROUND_SNR = 200.0
 
 
@@ -69,25 +66,3 @@ def demo_setup(*, paper: bool = False, views: int = 180, small: bool = False) ->
         poses=pose_grid(3) if paper else calibration_grid(2),
         scan=tilted_scan(views, eq11_triangle, R_HT=T_HT.R),
     )
-
-
-def rehearse(setup: DemoSetup) -> None:
-    """Run detection and calibration once on next to nothing, so that their kernels are compiled.
-
-    On a first run compiling takes longer than the work itself; done beside the simulation, whose kernels leave the
-    interpreter free, it costs no time of its own.
-    """
-    from tomopose.calibration.projection_matrices import projection_matrices
-    from tomopose.calibration.solve import calibrate
-    from tomopose.detection.run.detect import detect
-
-    tiny = setup.scanner.cropped(u=0, v=0, n_u=REHEARSAL_PX, n_v=REHEARSAL_PX)
-    middle = (REHEARSAL_PX - 1) / 2
-    v, u = np.mgrid[:REHEARSAL_PX, :REHEARSAL_PX]
-    ball = 1 / (1 + np.exp(20.0 - np.hypot(u - middle, v - middle)))
-    noise = np.random.default_rng(setup.seed).normal(scale=100.0, size=ball.shape)
-    detect([(20000 * ball + noise + 1000).astype(np.uint16)], tiny, ball_diameter=setup.ball_diameter)
-    poses = setup.poses
-    x_D = project_ball(setup.scanner, T_HT=setup.T_HT, T_MH=poses.T_MH, t=setup.t, alpha=poses.alpha)
-    calibration = calibrate(setup.scanner, poses, BallObservations.from_sigma(x_D, 0.01, pose_id=poses.pose_id))
-    projection_matrices(calibration, setup.scan.select([0]))

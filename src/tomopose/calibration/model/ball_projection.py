@@ -184,6 +184,7 @@ def _project_all(
     t_k: Array,
     t: Array,
     alpha: Array,
+    derivatives: bool,
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     n = R_k.shape[0]
     x, x_H, y_T = np.full((n, 2), np.nan), np.empty((n, 3)), np.empty((n, 3))
@@ -198,7 +199,7 @@ def _project_all(
             t_k[k],
             t[k],
             alpha[k],
-            True,
+            derivatives,
             x[k],
             x_H[k],
             G_H[k],
@@ -270,20 +271,11 @@ def projection_blocks(
     scanners = [scanner] if isinstance(scanner, Scanner) else list(scanner)
     s = np.array([scanner_vector(one, translation_scale) for one in scanners])
     n = len(T_MH)
-    t_k = np.ascontiguousarray(np.broadcast_to(np.asarray(t, dtype=np.float64), (n, 3)))
-    index = np.zeros(n, dtype=np.int64) if run is None else np.asarray(run, dtype=np.int64)
-    angle = np.ascontiguousarray(np.broadcast_to(np.asarray(alpha, dtype=np.float64), (n,)))
-    R_MH = np.ascontiguousarray(T_MH.R)
-    x, x_H, y_T, G_H, G_T, J_s = _project_all(
-        s,
-        index,
-        np.ascontiguousarray(T_HT.R),
-        np.ascontiguousarray(T_HT.t),
-        R_MH,
-        np.ascontiguousarray(T_MH.t),
-        t_k,
-        angle,
-    )
+    # Copies: contiguous and writable, whatever was given, so that the kernel is compiled for one kind of array.
+    t_k, angle = np.array(np.broadcast_to(t, (n, 3)), np.float64), np.array(np.broadcast_to(alpha, (n,)), np.float64)
+    index = np.zeros(n, dtype=np.int64) if run is None else np.array(run, dtype=np.int64)
+    R_MH, t_MH, R_HT, t_HT = (np.array(x, order="C") for x in (T_MH.R, T_MH.t, T_HT.R, T_HT.t))
+    x, x_H, y_T, G_H, G_T, J_s = _project_all(s, index, R_HT, t_HT, R_MH, t_MH, t_k, angle, True)
     return ProjectionBlocks(
         x_D=x, J_w_HT=-G_T @ skew(y_T), J_t_HT=G_T, J_t=G_H @ R_MH, J_scanner=J_s, x_H=x_H, t=t_k, R_MH=R_MH, G_H=G_H
     )

@@ -15,6 +15,10 @@ FAR = 1.0e12
 """Where a crossing lies that a half-space or an unbounded slab does not have, mm."""
 
 
+SIDE, FACE_1, FACE_3, FACE_5 = np.int64(0), np.int64(1), np.int64(3), np.int64(5)
+"""Numbers of faces.  numba compiles a function anew for each plain number that it is called with, not for these."""
+
+
 @njit(cache=True, nogil=True, inline="always")
 def _put(T: np.ndarray, S: np.ndarray, row: int, t_0: float, t_1: float, s_0: int, s_1: int) -> int:
     """Write one interval into a row of crossings; returns how many crossings that are (0 or 2)."""
@@ -161,9 +165,9 @@ def crossings(
         elif what == 2:
             n = _cone(lx, ly, lz, gx, gy, gz, a, b, p[q, 2], T, S, row)
         elif what == 3:
-            lo, hi, s_lo, s_hi = _slab(lx, gx, a, 1, -FAR, FAR, 0, 0)
-            lo, hi, s_lo, s_hi = _slab(ly, gy, b, 3, lo, hi, s_lo, s_hi)
-            lo, hi, s_lo, s_hi = _slab(lz, gz, p[q, 2], 5, lo, hi, s_lo, s_hi)
+            lo, hi, s_lo, s_hi = _slab(lx, gx, a, FACE_1, -FAR, FAR, SIDE, SIDE)
+            lo, hi, s_lo, s_hi = _slab(ly, gy, b, FACE_3, lo, hi, s_lo, s_hi)
+            lo, hi, s_lo, s_hi = _slab(lz, gz, p[q, 2], FACE_5, lo, hi, s_lo, s_hi)
             n = _put(T, S, row, lo, hi, s_lo, s_hi)
         elif what == 4:
             if ex * ex + ey * ey + ez * ez < (a + b) ** 2:
@@ -208,7 +212,7 @@ def _cylinder(
             return 0
         half = np.sqrt(inside / a)
         lo, hi = k - half, k + half
-    lo, hi, s_lo, s_hi = _slab(oz, dz, h, 1, lo, hi, 0, 0)
+    lo, hi, s_lo, s_hi = _slab(oz, dz, h, FACE_1, lo, hi, SIDE, SIDE)
     return _put(T, S, row, lo, hi, s_lo, s_hi)
 
 
@@ -228,7 +232,7 @@ def _cone(
     row: int,
 ) -> int:
     """Truncated cone, radius r + slope z for |z| <= h: convex, so one interval at most."""
-    lo, hi, s_lo, s_hi = _slab(oz, dz, h, 1, -FAR, FAR, 0, 0)
+    lo, hi, s_lo, s_hi = _slab(oz, dz, h, FACE_1, -FAR, FAR, SIDE, SIDE)
     if not hi > lo:
         return 0
     # x^2 + y^2 - (r + slope z)^2 = a t^2 + 2 b t + c, inside where negative; on |z| <= h the radius is not negative.

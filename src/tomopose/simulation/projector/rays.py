@@ -28,6 +28,9 @@ BUNDLE = 32
 """Rays that are looked at together, to find which solids they can meet at all."""
 LARGEST = 48
 """Most surface crossings on one ray inside one solid; a ray that needs more is an error, never a wrong path."""
+ROW_0, UNION, INTERSECTION, DIFFERENCE = np.int64(0), np.int64(-1), np.int64(-2), np.int64(-3)
+"""A row of crossings, and how two are combined.  numba compiles a function anew for each plain number that it is called
+with; these are values like any other."""
 
 
 class SolidArrays(NamedTuple):
@@ -140,7 +143,7 @@ def compile_solids(solids: list[Solid] | tuple[Solid, ...]) -> Compiled:
 
 @njit(cache=True, nogil=True)
 def _combine(T: np.ndarray, S: np.ndarray, a: int, na: int, b: int, nb: int, op: int, out: int) -> int:
-    """Merge rows a and b of crossings into row `out`: union (-1), intersection (-2) or difference (-3); -1 if too
+    """Merge rows a and b of crossings into row `out`: UNION, INTERSECTION or DIFFERENCE; -1 if too
     long."""
     i = j = n = 0
     in_a = in_b = inside = False
@@ -153,7 +156,7 @@ def _combine(T: np.ndarray, S: np.ndarray, a: int, na: int, b: int, nb: int, op:
             at, face = T[b, j], S[b, j]
             in_b = not in_b
             j += 1
-        now = (in_a or in_b) if op == -1 else ((in_a and in_b) if op == -2 else (in_a and not in_b))
+        now = (in_a or in_b) if op == UNION else ((in_a and in_b) if op == INTERSECTION else (in_a and not in_b))
         if now != inside:
             inside = now
             if n > 0 and T[out, n - 1] == at:
@@ -181,7 +184,7 @@ def _solid_crossings(
 ) -> int:
     """Crossings of solid k, by its postfix program, into row 0 of T and S; their number, -1 where a list overflowed."""
     spare = T.shape[0] - 1
-    top = n_now = 0
+    top = n_now = ROW_0
     for q in range(s.first[k], s.first[k + 1]):
         op = s.ops[q]
         if op >= 0:
@@ -193,10 +196,10 @@ def _solid_crossings(
         n_a, n_b = S[top - 1, LARGEST], S[top, LARGEST]
         n_now = n_a
         if n_b == 0:
-            if op == -2:
+            if op == INTERSECTION:
                 n_now = 0
         elif n_a == 0:
-            if op == -1:
+            if op == UNION:
                 n_now = n_b
                 T[top - 1, :n_b], S[top - 1, :n_b] = T[top, :n_b], S[top, :n_b]
         else:
@@ -241,7 +244,7 @@ def trace(
     signature = np.int64(0)
     spare = T.shape[0] - 1
     met = 0
-    taken, other, n_taken = T.shape[0] - 2, T.shape[0] - 3, 0
+    taken, other, n_taken = T.shape[0] - 2, T.shape[0] - 3, ROW_0
     # Later solids displace earlier ones: walk backwards and keep what is taken already.
     for k in range(len(s.first) - 2, -1, -1):
         if not active[k] or _misses(s, k, ox, oy, oz, dx, dy, dz):
@@ -252,9 +255,9 @@ def trace(
         if n_now == 0:
             continue
         met += 1
-        row, n_row = 0, n_now
+        row, n_row = ROW_0, n_now
         if n_taken > 0:
-            row, n_row = spare, _combine(T, S, 0, n_now, taken, n_taken, -3, spare)
+            row, n_row = spare, _combine(T, S, ROW_0, n_now, taken, n_taken, DIFFERENCE, spare)
             if n_row < 0:
                 return np.int64(-1)
         path = 0.0
@@ -264,7 +267,7 @@ def trace(
             signature = (signature * np.int64(1000003) + S[row, e] + 1) & np.int64(0x7FFFFFFFFFFF)
         L[s.material[k]] += path
         if k > 0:
-            n_taken = _combine(T, S, 0, n_now, taken, n_taken, -1, other)
+            n_taken = _combine(T, S, ROW_0, n_now, taken, n_taken, UNION, other)
             if n_taken < 0:
                 return np.int64(-1)
             taken, other = other, taken
