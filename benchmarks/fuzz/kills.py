@@ -1,15 +1,17 @@
 """Kill programs that write at random moments: what they leave is the whole old result or the whole new one.
 
-    python benchmarks/fuzz/kills.py --kills 200 --seed 1
+    python benchmarks/fuzz/kills.py --kills 200 --seed 1 [--only calibrate,export]
 
-A program writes two states of a result in turn, over and over, until a signal (KILL, TERM or INT) ends it.  Then the
-result must be one of the two, the next run must succeed, and nothing of the killed one may stay beside it.
+Four writers of the library and the verbs of `verbs.py` take turns.  A program writes two states of a result in turn,
+over and over, until a signal (KILL, TERM or INT) ends it.  Then the result must be one of the two, the next run must
+succeed, and nothing of the killed one may stay beside it.
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
+import os
 import random
 import signal
 import subprocess
@@ -21,12 +23,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from verbs import essence, prepare, verbs
 
 import tomopose as tp
 from tomopose.exports.folder import export
 from tomopose.files import atomic_folder, write_json, write_text
 from tomopose.io.volume_files import write_volume
 
+LONGEST = 0.4
+"""Latest moment of a kill after both states were written once, s."""
+RESUMED = ("simulate",)
+"""Verbs that write a file at a time and go on where they stopped: a next run must come to the whole result."""
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
 
@@ -64,6 +71,10 @@ WRITERS: dict[str, Callable[[Path, int], None]] = {
     "volume": write_hdf5_volume,
 }
 
+INPUTS = Path(tempfile.gettempdir()) / f"tomopose-kills-{os.getuid()}"
+"""What the verbs read; made once, before the first kill."""
+WRITERS |= verbs(INPUTS)
+
 PROGRAM = """
 import itertools, signal, sys
 sys.path[:0] = [sys.argv[1]]
@@ -85,24 +96,32 @@ except KeyboardInterrupt:
 
 
 def content(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file, by name; times of making are no part of a state, so JSON with provenance is left out."""
+    """SHA-256 of what every file says, by name; the manifest's digests follow from the files beside it."""
     files = (p for p in sorted(folder.rglob("*")) if p.is_file() and p.name != "manifest.json")
-    return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+    return {p.relative_to(folder).as_posix(): _digest(p) for p in files}
 
 
-def untimed(found: dict[str, str]) -> dict[str, str]:
-    """Without the files that hold the time of their making."""
-    return {name: digest for name, digest in found.items() if not name.endswith((".config", "projtable.txt", ".h5"))}
+def _digest(path: Path) -> str:
+    try:
+        return hashlib.sha256(essence(path).encode()).hexdigest()
+    except (OSError, ValueError) as error:  # part of a file, which no state is
+        return f"unreadable: {error}"
 
 
 def visible(folder: Path) -> dict[str, str]:
-    return {name: digest for name, digest in content(folder).items() if not name.startswith(".")}
+    return {name: digest for name, digest in content(folder).items() if not Path(name).name.startswith(".")}
+
+
+def differences(found: dict[str, str], states: list[dict[str, str]]) -> list[str]:
+    """The files in which something found differs from each state, at most four of each."""
+    return [str(sorted(dict(found.items() ^ state.items()))[:4]) for state in states]
 
 
 def kill_once(name: str, folder: Path, rng: random.Random) -> str:
     """One kill; "old or new", or what is wrong with what was left."""
     states = []
     for state in (0, 1):
+        (folder / "fresh" / str(state)).mkdir(parents=True)
         WRITERS[name](folder / "fresh" / str(state), state)
         states.append(visible(folder / "fresh" / str(state)))
     place = folder / "killed"
@@ -111,21 +130,21 @@ def kill_once(name: str, folder: Path, rng: random.Random) -> str:
     with subprocess.Popen(command, stdout=subprocess.PIPE) as program:
         assert program.stdout is not None
         program.stdout.readline()
-        time.sleep(rng.uniform(0, 0.2))
+        time.sleep(rng.uniform(0, LONGEST))
         number = rng.choice(SIGNALS)
         program.send_signal(number)
         program.wait()
     found = visible(place)
-    if untimed(found) not in [untimed(s) for s in states] or set(found) not in [set(s) for s in states]:
-        return f"a mixture: {sorted(found)}"
-    if name == "exports":
+    if name not in RESUMED and found not in states:
+        return f"a mixture: {differences(found, states)}"
+    if name in ("exports", "export"):
         tp.read_geometry(place / "out")
     if number != signal.SIGKILL and set(content(place)) != set(found):
         return f"temporary files after {number.name}: {sorted(set(content(place)) - set(found))}"
     WRITERS[name](place, 1)
-    left = {p.name for p in place.iterdir() if p.name.startswith(".")}
-    if left or untimed(visible(place)) != untimed(states[1]):
-        return f"the next run left {sorted(left)}, or another result"
+    left = sorted(p.name for p in place.rglob(".*"))
+    if left or visible(place) != states[1]:
+        return f"the next run left {left}, or another result: {differences(visible(place), states[1:])}"
     return "old or new"
 
 
@@ -133,11 +152,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", default="", help="writers by name, as a,b; default: all")
     args = parser.parse_args()
+    wanted = [name for name in WRITERS if not args.only or name in args.only.split(",")]
+    prepare(INPUTS)
     rng = random.Random(args.seed)
     found: Counter[str] = Counter()
     for k in range(args.kills):
-        name = list(WRITERS)[k % len(WRITERS)]
+        name = wanted[k % len(wanted)]
         with tempfile.TemporaryDirectory() as root:
             found[f"{name}: {kill_once(name, Path(root), rng)}"] += 1
     for what, times in found.most_common():

@@ -185,7 +185,7 @@ def note_done(jobs: Iterable[str]) -> None:
     folder = kernel_cache.kept_in(PACKAGE)
     if folder is not None:
         document = {"key": _key(), "jobs": sorted(compiled_jobs() | set(jobs))}
-        write_text(folder / NOTE, json.dumps(document), force=True)
+        write_text(folder / NOTE, json.dumps(document))
 
 
 def _key() -> str:
