@@ -186,7 +186,7 @@ from .simulation.run import SimulatedRun as SimulatedRun
 from .simulation.run import simulate_ball_run as simulate_ball_run
 from .simulation.scene.build import simulate as simulate
 from .simulation.scene.ctsimu import run_from_ctsimu as run_from_ctsimu
-from .simulation.scene.ctsimu import run_to_ctsimu as run_to_ctsimu
+from .simulation.scene.ctsimu_writing import run_to_ctsimu as run_to_ctsimu
 from .simulation.scene.scene import BallPart as BallPart
 from .simulation.scene.scene import DetectorPart as DetectorPart
 from .simulation.scene.scene import FilterPart as FilterPart

@@ -32,6 +32,7 @@ class BallObservations(Rows):
     image:      n file names, or None.
     snr, semi_major, semi_minor, angle: (n,) background SNR, silhouette ellipse (px, px, rad), NaN where unknown.
     x_ellipse:  (n, 2) px, centre of the silhouette's ellipse: *not* the projected centre (paper ref. [19]).
+    ball_id:    (n,) whole numbers from 0: which ball each row is of, or None where the pose table alone says so.
     ball_diameter: mm, of every ball here, or None; with the semi axes it is a gauge of the calibrated magnification.
     """
 
@@ -46,6 +47,7 @@ class BallObservations(Rows):
     semi_minor: Array | None = None
     angle: Array | None = None
     x_ellipse: Array | None = None
+    ball_id: Any = None
     ball_diameter: float | None = None
 
     def __post_init__(self) -> None:
@@ -60,7 +62,10 @@ class BallObservations(Rows):
             raise ShapeError(f"{n} observations but {len(ids)} pose ids")
         twice = [i for i, count in Counter(ids).items() if count > 1]
         if twice:
-            raise InputError(f"pose_id {twice[0]!r} is observed more than once ({len(twice)} ids repeat)")
+            raise InputError(
+                f"pose_id {twice[0]!r} is observed more than once ({len(twice)} ids repeat); two balls in one image "
+                "have two rows, with different ids, in the pose table, too"
+            )
         finite = np.isfinite(x_D).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
         seen = finite.copy() if self.seen is None else np.array(self.seen, dtype=bool)
         if seen.shape != (n,):
@@ -88,6 +93,12 @@ class BallObservations(Rows):
             if len(self.image) != n:
                 raise ShapeError(f"{n} observations but {len(self.image)} image names")
             object.__setattr__(self, "image", tuple(self.image))
+        if self.ball_id is not None:
+            ball_id = np.array(self.ball_id, dtype=np.int64)
+            if ball_id.shape != (n,):
+                raise ShapeError(f"{n} observations but ball_id has shape {ball_id.shape}")
+            ball_id.setflags(write=False)
+            object.__setattr__(self, "ball_id", ball_id)
         if self.ball_diameter is not None and not (np.isfinite(self.ball_diameter) and self.ball_diameter > 0):
             raise InputError(f"ball_diameter is {self.ball_diameter}; a diameter above 0 in mm is needed")
         for name in (*OPTIONAL_COLUMNS, "x_ellipse"):
@@ -120,7 +131,7 @@ class BallObservations(Rows):
             "seen": self.seen, "status": self.status or (),
         }  # fmt: skip
         units = {"snr": "snr", "semi_major": "semi_major_px", "semi_minor": "semi_minor_px", "angle": "angle_rad"}
-        given = {units[name]: getattr(self, name) for name in OPTIONAL_COLUMNS}
+        given = {units[name]: getattr(self, name) for name in OPTIONAL_COLUMNS} | {"ball_id": self.ball_id}
         return columns | {name: held for name, held in given.items() if held is not None}
 
     @property
@@ -143,7 +154,7 @@ class BallObservations(Rows):
             seen=self.seen[i],
             status=tuple(self.status[k] for k in i) if self.status is not None else None,
             image=None if self.image is None else tuple(self.image[k] for k in i),
-            **{name: of(getattr(self, name)) for name in (*OPTIONAL_COLUMNS, "x_ellipse")},
+            **{name: of(getattr(self, name)) for name in (*OPTIONAL_COLUMNS, "x_ellipse", "ball_id")},
         )
 
     def with_ball_diameter(self, ball_diameter: float | None) -> BallObservations:

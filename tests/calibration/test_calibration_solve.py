@@ -95,6 +95,20 @@ def test_several_balls_have_one_centre_each(scanner, T_HT, rng):
     assert cal.tangent[6:9] == ("t[3]_x", "t[3]_y", "t[3]_z")
 
 
+def test_the_observations_name_the_balls_where_the_pose_table_does_not(scanner, T_HT, rng):
+    poses = mixed_poses(rng, 60, ball_id=np.repeat([3, 7], 30))
+    t = {3: np.array([4.0, -2.0, 9.0]), 7: np.array([-15.0, 6.0, 1.0])}
+    observed = observe(scanner, poses, T_HT, np.array([t[b] for b in poses.ball_id]))
+    named = replace(observed, ball_id=poses.ball_id)
+    cal = calibrate(scanner, replace(poses, ball_id=None), named[::-1], hypotheses=False)
+    for ball, centre in t.items():
+        np.testing.assert_allclose(cal.balls[ball], centre, rtol=0, atol=1e-9)
+    wrong = np.array(poses.ball_id)
+    wrong[[4, 40]] = [7, 3]
+    with pytest.raises(InputError, match=r"pose '4': the pose table says ball 3, the observations ball 7 \(2 of"):
+        calibrate(scanner, poses, replace(observed, ball_id=wrong), hypotheses=False)
+
+
 def test_errors_stay_inside_three_predicted_sigmas(scanner, T_HT, rng):
     poses, t = grid_poses(), np.array([1.0, -2.0, 3.0])
     for _ in range(5):

@@ -178,6 +178,7 @@ def test_two_balls_in_one_image(run: tuple[Scanner, list[np.ndarray], np.ndarray
         truth = np.array([large.x_D, small.x_D])
         with_places = detect([image] * 2, scanner, ball_diameter=sizes, ball_id=[0, 7], predicted=truth + 3.0)
         assert np.abs(with_places.x_D - truth).max() < 0.02
+        assert list(with_places.ball_id) == [0, 7]
         without = detect([image] * 2, scanner, ball_diameter=sizes, ball_id=[0, 7])
         if by_size:
             assert np.abs(without.x_D - truth).max() < 0.02

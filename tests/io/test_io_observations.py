@@ -32,7 +32,7 @@ def same(a: BallObservations, b: BallObservations) -> None:
     np.testing.assert_array_equal(a.seen, b.seen)
     np.testing.assert_array_equal(a.x_D[a.seen], b.x_D[b.seen])
     np.testing.assert_array_equal(a.covariance[a.seen], b.covariance[b.seen])
-    for name in (*COLUMNS, "x_ellipse"):
+    for name in (*COLUMNS, "x_ellipse", "ball_id"):
         left, right = getattr(a, name), getattr(b, name)
         assert (left is None) == (right is None)
         if left is not None:
@@ -64,6 +64,7 @@ def test_everything_comes_back_bit_for_bit(tmp_path, rng):
         semi_minor=rng.random(n),
         angle=rng.random(n),
         x_ellipse=x_D + 0.01,
+        ball_id=np.arange(n) % 3,
     )
     write_observations(tmp_path / "o.csv", obs)
     same(read_observations(tmp_path / "o.csv"), obs)
@@ -74,6 +75,16 @@ def test_uncorrelated_observations_need_no_covariance_column(tmp_path):
     write_observations(tmp_path / "o.csv", obs)
     assert "cov_uv" not in (tmp_path / "o.csv").read_text()
     same(read_observations(tmp_path / "o.csv"), obs)
+
+
+def test_a_ball_id_is_a_whole_number_from_0(table):
+    read = read_observations(table(f"{HEAD},ball_id\n7,1,2,0.1,0.1,0\n8,3,4,0.1,0.1,12\n"))
+    np.testing.assert_array_equal(read.ball_id, [0, 12])
+    np.testing.assert_array_equal(read[1:].ball_id, [12])
+    assert read_observations(table(GOOD)).ball_id is None
+    for bad in ("-1", "1.5"):
+        with pytest.raises(InputError, match=rf"row 1.*ball_id.*{bad} is no whole number from 0"):
+            read_observations(table(f"{HEAD},ball_id\n7,1,2,0.1,0.1,{bad}\n"))
 
 
 @given(st.floats(1e-12, 1e6))

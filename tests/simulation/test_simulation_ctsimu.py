@@ -14,8 +14,9 @@ from tomopose.geometry.frames import Frame
 from tomopose.simulation.objects.mesh import write_stl
 from tomopose.simulation.objects.shapes import Solid, box, cylinder
 from tomopose.simulation.projector.focal_spot import FocalSpot
-from tomopose.simulation.run import ball_spectrum, simulate_ball_run, transmission
-from tomopose.simulation.scene.ctsimu import run_from_ctsimu, run_to_ctsimu
+from tomopose.simulation.run import ball_spectrum, render, simulate_ball_run, transmission
+from tomopose.simulation.scene.ctsimu import run_from_ctsimu
+from tomopose.simulation.scene.ctsimu_writing import run_to_ctsimu
 
 pytest.importorskip("embreex")
 pytest.importorskip("manifold3d")
@@ -70,6 +71,84 @@ def test_what_is_not_read_is_refused(run, tmp_path):
         run_from_ctsimu({**content, "samples": [], "source": {**content["source"], "voltage": None}})
     with pytest.raises(InputError, match="names no mesh file"):
         run_from_ctsimu({**content, "samples": [{"name": "x"}]})
+
+
+def test_a_sample_stands_where_the_toolbox_puts_it(run, tmp_path):
+    """The centre is that of the mesh's box; deviations turn about the stage's and the sample's own axes, in order."""
+    ctsimu = pytest.importorskip("ctsimu.scenario")
+    content, files = run_to_ctsimu(run)
+    for name, mesh in files.items():
+        write_stl(tmp_path / name, mesh)
+
+    def turn(axis, deg, pivot=None):
+        entry = {"type": "rotation", "axis": axis, "amount": {"value": deg, "unit": "deg"}}
+        return entry if pivot is None else {**entry, "pivot": pivot}
+
+    place = content["samples"][0]["position"]
+    place["center"] = {a: {"value": x, "unit": "mm"} for a, x in zip("uvw", (3.0, -2.0, 1.0), strict=True)}
+    place["vector_r"] = {a: {"value": x} for a, x in zip("uvw", (0.0, 2.0, 0.0), strict=True)}
+    place["deviations"] = [
+        turn({a: {"value": x} for a, x in zip("rst", (0, 0, 1), strict=True)}, -14.0),
+        turn("s", 8.0),
+        turn("u", 30.0, {a: {"value": x, "unit": "mm"} for a, x in zip("uvw", (1, 2, 3), strict=True)}),
+        {"type": "translation", "axis": "w", "amount": {"value": 0.7, "unit": "mm"}, "known_to_reconstruction": False},
+    ]
+    toolbox = ctsimu.Scenario(json_dict=json.loads(json.dumps(content)))
+    toolbox.set_frame(0)
+    theirs = toolbox.samples[0].coordinate_system
+    axes = np.column_stack([[v.x(), v.y(), v.z()] for v in (theirs.u, theirs.v, theirs.w)])
+    centre = np.array([theirs.center.x(), theirs.center.y(), theirs.center.z()])
+    x = next(iter(files.values())).vertices
+    wanted = (x - (x.min(axis=0) + x.max(axis=0)) / 2) @ axes.T + centre
+    found = run_from_ctsimu(content, folder=tmp_path).meshes[0].mesh.vertices * [-1.0, -1.0, 1.0]
+    for of in (np.min, np.max, np.mean):
+        np.testing.assert_allclose(of(found, axis=0), of(wanted, axis=0), atol=1e-5)
+    place["deviations"] = [turn("x", 1.0)]
+    with pytest.raises(InputError, match=r"components along u, v, w or r, s, t are needed"):
+        run_from_ctsimu(content, folder=tmp_path)
+    place["center"] = {a: {"value": 0.0, "unit": "mm"} for a in "xyz"}
+    with pytest.raises(InputError, match="samples must be on the stage"):
+        run_from_ctsimu(content, folder=tmp_path)
+
+
+def test_images_show_deviations_that_a_reconstruction_does_not_know(run, tmp_path):
+    content, files = run_to_ctsimu(run)
+    for name, mesh in files.items():
+        write_stl(tmp_path / name, mesh)
+    content = json.loads(json.dumps(content))
+    before = run_from_ctsimu(content, folder=tmp_path).T_MH.t[0]
+    shift = {"type": "translation", "axis": "x", "amount": {"value": 2.0, "unit": "mm"}}
+    content["geometry"]["stage"]["deviations"].append({**shift, "known_to_reconstruction": False})
+    moved = run_from_ctsimu(content, folder=tmp_path)
+    assert np.linalg.norm(moved.T_MH.t[0] - before) + abs(moved.scanner.d_SR - 200.0) > 1.0
+
+
+def test_the_toolbox_s_own_scenarios_are_read(tmp_path):
+    helpers = pytest.importorskip("ctsimu.helpers")
+    scenario = helpers.json_from_pkg(helpers.pkg_scenario("2D-FB-2_2021-03-24v06r00dp.json"))
+    (tmp_path / scenario["source"]["spectrum"]["file"]["value"]).write_text("# keV,photons\n60,1\n80,2\n")
+    read = run_from_ctsimu(scenario, folder=tmp_path)
+    assert read.detector.output == "raw"
+    image = render(read, 0)
+    u = (np.arange(501) - 250) * 0.4
+    inside = np.arctan2((u + 0.2)[:, None] * 0.2, 30 * np.sqrt((u + 0.2)[:, None] ** 2 + 0.04 + 900))
+    outside = np.arctan2((u - 0.2)[:, None] * 0.2, 30 * np.sqrt((u - 0.2)[:, None] ** 2 + 0.04 + 900))
+    angle = (inside - outside)[:, 0]
+    np.testing.assert_allclose(image[250], 60000 * angle / angle.max(), atol=0.51)
+    scenario["source"]["spectrum"]["monochromatic"] = True
+    np.testing.assert_array_equal(run_from_ctsimu(scenario, folder=tmp_path).spectrum.energy, [60, 80])
+
+
+def test_dark_and_white_grey_values_are_the_scenario_s(run, tmp_path):
+    content, files = run_to_ctsimu(run)
+    for name, mesh in files.items():
+        write_stl(tmp_path / name, mesh)
+    content["detector"]["gray_value"] |= {"imin": {"value": 500}, "imax": {"value": 40500}}
+    read = run_from_ctsimu(content, folder=tmp_path).detector
+    assert (read.dark, read.white) == (500.0, 40000.0)
+    content["detector"]["gray_value"]["imin"] = {"value": 50000}
+    with pytest.raises(InputError, match="0 <= imin < imax"):
+        run_from_ctsimu(content, folder=tmp_path)
 
 
 def test_null_parameters_are_not_asked_for_and_a_spectrum_file_is_read(run, tmp_path):

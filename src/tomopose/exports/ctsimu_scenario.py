@@ -160,14 +160,8 @@ def _part(geo: Mapping[str, Any], n: int, where: str, turn: Array | None) -> _Po
         vector, moved = _vector(_section(geo, name, where), "xyz", n, "", f"{where}.{name}")
         if moved.any():
             raise InputError(f"{where}.{name} drifts; its meaning beside deviations is not settled, it is not read")
-        if not np.linalg.norm(vector) > 0:
-            raise InputError(f"{where}.{name} has length 0")
-        directions.append(vector / np.linalg.norm(vector))
-    u, w = directions
-    if abs(u @ w) > 1e-6:
-        raise InputError(f"{where}: vector_u and vector_w are not at right angles (cosine {u @ w:.3g})")
-    v = np.cross(w, u)
-    axes = np.repeat(np.stack([u, v, w], axis=-1)[None], n, axis=0)
+        directions.append(vector)
+    axes = np.repeat(_right_handed(*directions, where, "vector_u", "vector_w")[None], n, axis=0)
     if turn is not None:
         axes = axes @ R_z(turn)
     pose = _Pose(centre=np.repeat(base[None], n, axis=0), axes=axes)
@@ -178,8 +172,56 @@ def _part(geo: Mapping[str, Any], n: int, where: str, turn: Array | None) -> _Po
     return _Pose(centre=pose.centre + drift, axes=pose.axes)
 
 
-def _deviate(pose: _Pose, deviation: Mapping[str, Any], n: int, where: str) -> _Pose:
-    """The pose after one deviation: a shift along, or a turn about, an axis of the world or of the part itself."""
+def sample_pose(position: Mapping[str, Any], where: str) -> tuple[Array, Array]:
+    """(centre (3,), mm, axes (3, 3) with columns r, s, t) of a sample on the stage, in the stage's coordinates u, v, w.
+
+    The centre is that of the sample's bounding box along its own axes. Deviations turn or shift it about the stage's
+    axes (u, v, w) or its own (r, s, t) as they then stand; whether a reconstruction knows them does not matter here.
+    InputError for a sample that is fixed to the world, and for drifts.
+    """
+    _known(position, ("center", "centre", "vector_r", "vector_t", "deviations"), where)
+    directions = []
+    for name, entry in (("center", position.get("centre") or position.get("center")), *(
+        (name, position.get(name)) for name in ("vector_r", "vector_t"))):  # fmt: skip
+        if not (isinstance(entry, Mapping) and all(k in entry for k in "uvw")):
+            raise InputError(f"{where}.{name} is not given along u, v, w; samples must be on the stage")
+        vector, drift = _vector(entry, "uvw", 1, "mm" if name == "center" else "", f"{where}.{name}")
+        if drift.any():
+            raise InputError(f"{where}.{name} drifts; samples that move on the stage are not read")
+        directions.append(vector)
+    centre, r, t = directions
+    pose = _Pose(centre=centre[None], axes=_right_handed(r, t, where, "vector_r", "vector_t")[None])
+    for k, deviation in enumerate(_list(position.get("deviations"), f"{where}.deviations")):
+        if deviation is None or deviation.get("amount", 0) is None:
+            continue  # null: not relevant
+        pose = _deviate(pose, deviation, 1, f"{where}.deviations[{k}]", world="uvw", own=("rst",))
+    return pose.centre[0], pose.axes[0]
+
+
+def _right_handed(u: Array, w: Array, where: str, name_u: str, name_w: str) -> Array:
+    """(3, 3), columns u, w x u, w of length 1; InputError where u and w are no directions at right angles."""
+    for name, vector in ((name_u, u), (name_w, w)):
+        if not np.linalg.norm(vector) > 0:
+            raise InputError(f"{where}.{name} has length 0")
+    u, w = u / np.linalg.norm(u), w / np.linalg.norm(w)
+    if abs(u @ w) > 1e-6:
+        raise InputError(f"{where}: {name_u} and {name_w} are not at right angles (cosine {u @ w:.3g})")
+    return np.stack([u, np.cross(w, u), w], axis=-1)
+
+
+def _deviate(
+    pose: _Pose,
+    deviation: Mapping[str, Any],
+    n: int,
+    where: str,
+    *,
+    world: str = "xyz",
+    own: tuple[str, ...] = ("uvw", "rst"),
+) -> _Pose:
+    """The pose after one deviation: a shift along, or a turn about, an axis of the world or of the part itself.
+
+    world, own: the letters of the coordinates that the pose is in, and of the part's own axes.
+    """
     _known(deviation, ("type", "axis", "pivot", "amount", "known_to_reconstruction"), where)
     if not _is_known(deviation, where):
         return pose
@@ -193,31 +235,31 @@ def _deviate(pose: _Pose, deviation: Mapping[str, Any], n: int, where: str) -> _
     axis = deviation.get("axis")
     if isinstance(axis, str) and len(axis) == 1 and axis in "xyzuvwrst":
         axis = {k: float(k == axis) for k in next(s for s in ("xyz", "uvw", "rst") if axis in s)}
-    direction, local = _free_vector(axis, n, "", f"{where}.axis")
+    direction, letters = _free_vector(axis, n, "", f"{where}.axis", (world, *own))
     length = np.linalg.norm(direction, axis=1, keepdims=True)
     if not length.min() > 0:
         raise InputError(f"{where}.axis has length 0")
     direction = direction / length
-    if local:
+    if letters in own:
         direction = (pose.axes @ direction[..., None])[..., 0]
     if kind == "translation":
         return _Pose(centre=pose.centre + amount[:, None] * direction, axes=pose.axes)
     pivot = pose.centre
     if deviation.get("pivot") is not None:
-        pivot, local = _free_vector(deviation["pivot"], n, "mm", f"{where}.pivot")
-        if local:
+        pivot, letters = _free_vector(deviation["pivot"], n, "mm", f"{where}.pivot", (world, *own))
+        if letters in own:
             pivot = pose.centre + (pose.axes @ pivot[..., None])[..., 0]
     R = exp_rotation(amount[:, None] * direction)
     return _Pose(centre=pivot + (R @ (pose.centre - pivot)[..., None])[..., 0], axes=R @ pose.axes)
 
 
-def _free_vector(json: Any, n: int, kind: str, where: str) -> tuple[Array, bool]:
-    """(n, 3) and whether it is written in the part's own axes (u, v, w, or r, s, t) rather than the world's."""
-    for names in ("xyz", "uvw", "rst"):
+def _free_vector(json: Any, n: int, kind: str, where: str, known: Sequence[str]) -> tuple[Array, str]:
+    """(n, 3) and the letters of the axes that it is written in, one of `known`."""
+    for names in known:
         if isinstance(json, Mapping) and all(k in json for k in names):
             base, drift = _vector(json, names, n, kind, where)
-            return base + drift, names != "xyz"
-    raise InputError(f"{where} is {json!r}; x, y, z or u, v, w components are needed")
+            return base + drift, names
+    raise InputError(f"{where} is {json!r}; components along {' or '.join(', '.join(k) for k in known)} are needed")
 
 
 def _vector(json: Mapping[str, Any], names: str, n: int, kind: str, where: str) -> tuple[Array, Array]:

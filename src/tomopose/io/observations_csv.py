@@ -23,7 +23,7 @@ NUMBERS = {"snr": "snr", "semi_major": "semi_major_px", "semi_minor": "semi_mino
 ELLIPSE = ("u_ellipse_px", "v_ellipse_px")
 DIAMETER = "ball_diameter_mm"
 COVARIANCE = "cov_uv_px2"
-KNOWN = (*REQUIRED, "image", "seen", "status", *NUMBERS.values(), *ELLIPSE, COVARIANCE)
+KNOWN = (*REQUIRED, "image", "ball_id", "seen", "status", *NUMBERS.values(), *ELLIPSE, COVARIANCE)
 SMALLEST_SIGMA_PX, LARGEST_SIGMA_PX = 1e-9, 1e4
 """The best radiographs give 1e-4 px, and 1e-9 px is rounding; 1e4 px is wider than a panel."""
 YES, NO = ("1", "true", "yes"), ("0", "false", "no")
@@ -63,6 +63,7 @@ def read_observations(path: str | Path) -> BallObservations:
             status=table.words("status") if "status" in table.columns else None,
             image=table.words("image") if "image" in table.columns else None,
             x_ellipse=np.column_stack([table.numbers(c, blank=anywhere) for c in ELLIPSE]) if all(ellipse) else None,
+            ball_id=table.whole_numbers("ball_id") if "ball_id" in table.columns else None,
             ball_diameter=_ball_diameter(table),
             **numbers,
         )
@@ -152,6 +153,8 @@ def write_observations(
         columns[COVARIANCE] = C[:, 0, 1].tolist()
     if obs.image is not None:
         columns["image"] = obs.image
+    if obs.ball_id is not None:
+        columns["ball_id"] = obs.ball_id.tolist()
     columns["seen"] = [int(s) for s in obs.seen]
     columns["status"] = obs.status
     for name, column in NUMBERS.items():

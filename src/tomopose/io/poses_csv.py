@@ -119,7 +119,7 @@ def poses_from_table(
         T_MH=measured,
         pose_id=_pose_id(table),
         alpha=np.radians(alpha),
-        ball_id=_ball_id(table),
+        ball_id=table.whole_numbers("ball_id") if "ball_id" in table.columns else None,
         image=_image(table),
         time_utc=_time(table),
         T_MH_set=commanded,
@@ -270,15 +270,6 @@ def _require_different(table: TextTable, column: str, cells: Sequence[object]) -
             f"{table.path}: {column} {name!r} appears in rows {rows[0] + 1} and {rows[1] + 1} "
             f"({len(twice)} repeat); each may appear once"
         )
-
-
-def _ball_id(table: TextTable) -> np.ndarray | None:
-    if "ball_id" not in table.columns:
-        return None
-    values = table.numbers("ball_id")
-    for i in np.flatnonzero((values != np.round(values)) | (values < 0)):
-        raise InputError(f"{table.where(int(i), 'ball_id')}: {values[i]:g} is no whole number from 0")
-    return values.astype(np.int64)
 
 
 def _image(table: TextTable) -> tuple[str, ...] | None:

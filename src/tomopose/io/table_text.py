@@ -76,6 +76,13 @@ class TextTable:
                 values[i] = self._number(cell, i, column)
         return values
 
+    def whole_numbers(self, column: str) -> np.ndarray:
+        """A column of whole numbers from 0, (n,) int64.  InputError names row and column of any other."""
+        values = self.numbers(column)
+        for i in np.flatnonzero((values != np.round(values)) | (values < 0)):
+            raise InputError(f"{self.where(int(i), column)}: {values[i]:g} is no whole number from 0")
+        return values.astype(np.int64)
+
     def digits(self, cell: str) -> str:
         """A cell's number as Python writes it."""
         written = NUMPY_REPR.fullmatch(cell)

@@ -47,6 +47,7 @@ class SimulatedRun:
     solids, spectrum, detector: what is imaged, the spectrum as the detector weighs it, and the detector.
     spot, motion:   focal spot, and movement during one exposure.
     meshes:         solids given by triangles; they must not overlap each other or the other solids.
+                    Without solids and meshes the images are those of the empty beam.
     materials:      what the names of materials mean.
     engine:         "own", or "gvxr" to let gVirtualXray cast the rays.
     seed:           of all random numbers.
@@ -70,8 +71,6 @@ class SimulatedRun:
 
     def __post_init__(self) -> None:
         self.T_HT.require(Frame.H, Frame.T)
-        if not (self.solids or self.meshes):
-            raise InputError("there is nothing to image: the run has neither solids nor meshes")
         if len(self.T_MH.require(Frame.M, Frame.H)) != len(self.poses):
             raise ShapeError(f"{len(self.poses)} poses but {len(self.T_MH)} true poses")
         if self.t is not None:
@@ -164,6 +163,8 @@ def _run(values: dict[str, Any]) -> SimulatedRun:
 def transmission(run: SimulatedRun, i: int, *, threads: int = 1) -> Array:
     """Image (n_v, n_u) of pose i as a share of the empty beam: geometry, spectrum, focal spot, motion, unsharpness."""
     scanner, detector, spot, motion = run.scanner, run.detector, run.spot, run.motion
+    if not (run.solids or run.meshes):
+        return np.ones(scanner.shape)
     frames = run.frames(i)
     depth = float(scanner.T_WS.apply(frames[Frame.M].t)[2])
     spot_u, spot_v = spot.blur(scanner.d_SD / depth, scanner.p_u, scanner.p_v)

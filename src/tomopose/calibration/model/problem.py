@@ -131,6 +131,28 @@ def _as_runs(value: Any, kind: type) -> list[Any]:
     return [value] if isinstance(value, kind) else list(value)
 
 
+def _balls(poses: PoseSequence, observations: BallObservations, rows: Array, k: Array) -> Array:
+    """(len(rows),) which ball each observed row is of; k: the rows' poses.
+
+    A pose table without ball ids has one ball, 0; the observations then say which. InputError where both name balls
+    and differ.
+    """
+    named = np.asarray(poses.ball_id)
+    if observations.ball_id is None:
+        return np.asarray(named[k])
+    seen = np.asarray(observations.ball_id)[rows]
+    if not named.any():
+        return np.asarray(seen)
+    off = np.flatnonzero(seen != named[k])
+    if off.size:
+        i = int(off[0])
+        raise InputError(
+            f"pose {poses.pose_id[k[i]]!r}: the pose table says ball {named[k[i]]}, the observations ball {seen[i]} "
+            f"({off.size} of {len(rows)} rows differ); correct one of the two ball_id columns"
+        )
+    return np.asarray(seen)
+
+
 def pair(
     scanner: Scanner | Sequence[Scanner],
     poses: PoseSequence | Sequence[PoseSequence],
@@ -141,7 +163,8 @@ def pair(
     Runs share the mount T_HT and, under one ball_id, the ball.  One scanner serves all runs or each has its own
     (magnifications differ in d_SR).  In several runs ids are written RUN:ID.
 
-    Raises InputError for ids without a pose, fewer than five observed poses, and pivots that differ between runs.
+    Raises InputError for ids without a pose, fewer than five observed poses, ball ids that contradict each other, and
+    pivots that differ between runs.
     """
     runs_p, runs_o = _as_runs(poses, PoseSequence), _as_runs(observations, BallObservations)
     scanners = _as_runs(scanner, Scanner)
@@ -174,7 +197,7 @@ def pair(
         parts["alpha"].append(np.asarray(p.alpha)[k])
         parts["run"].append(np.full(len(k), r))
         parts["index"].append(k)
-        parts["ball"].append(np.asarray(p.ball_id)[k])
+        parts["ball"].append(_balls(p, o, rows, k))
         parts["x"].append(o.x_D[rows])
         parts["C"].append(o.covariance[rows])
         parts["outline"].append(np.full(len(rows), np.nan) if o.outline is None else o.outline[rows])

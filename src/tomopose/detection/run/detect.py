@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -72,7 +73,8 @@ def detect(
     -------
     BallObservations: an image that cannot be measured has seen False and its status begins with the reason ("not
     found", "truncated", "ambiguous", "saturated rim", "too few photons", "bad pixels on the rim", "bad image"); a
-    measured one is "ok" or names its flags (flags.FLAGS).  The numbers do not depend on workers or executor.
+    measured one is "ok" or names its flags (flags.FLAGS); `ball_id` is that of the rows, where it was given.  The
+    numbers do not depend on workers or executor.
 
     Raises
     ------
@@ -132,7 +134,8 @@ def detect(
             progress(len(rows), total)
     refuse_unusable(rows, settings.run)
     found = _observations(diameters.judged(rows, scanner, settings), ids, names, settings)
-    return found.with_ball_diameter(diameters.common)
+    found = found.with_ball_diameter(diameters.common)
+    return found if diameters.ball_id is None else replace(found, ball_id=diameters.ball_id)
 
 
 NOTHING = np.zeros((0, 0))

@@ -132,15 +132,20 @@ class Detector:
 
 
 def beam_profile(scanner: Scanner, detector: Detector) -> Array | None:
-    """The empty beam over the panel, 1 at its strongest: (d / distance)^2 cos(obliquity); None where it is even."""
+    """The empty beam over the panel (n_v, n_u), 1 at its strongest; None where it is even.
+
+    A pixel gets its share of an isotropic point source: the solid angle that it subtends, which is near
+    p_u p_v cos(obliquity) / distance^2. A rectangle from the source's foot point on the panel to (a, b), at the
+    distance d, subtends atan(a b / (d sqrt(a^2 + b^2 + d^2))).
+    """
     if not detector.falloff:
         return None
     U, V, O = scanner.panel
-    x = O + np.arange(scanner.n_u)[None, :, None] * U + np.arange(scanner.n_v)[:, None, None] * V
-    distance = np.linalg.norm(x, axis=2)
-    normal = np.cross(U, V) / np.linalg.norm(np.cross(U, V))
-    profile = np.abs(x @ normal) / distance**3
-    return np.asarray(profile / profile.max())
+    a = O @ (U / np.linalg.norm(U)) + (np.arange(scanner.n_u + 1) - 0.5) * np.linalg.norm(U)
+    b = O @ (V / np.linalg.norm(V)) + (np.arange(scanner.n_v + 1)[:, None] - 0.5) * np.linalg.norm(V)
+    d = abs(O @ np.cross(U, V)) / (np.linalg.norm(U) * np.linalg.norm(V))
+    solid_angle = np.diff(np.diff(np.arctan2(a * b, d * np.sqrt(a * a + b * b + d * d)), axis=0), axis=1)
+    return np.asarray(solid_angle / solid_angle.max())
 
 
 @functools.lru_cache(maxsize=4)

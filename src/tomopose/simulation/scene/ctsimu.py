@@ -1,4 +1,4 @@
-"""CTSimU scenarios (format 1.0 to 1.2) as runs of the virtual scanner, and runs as scenarios, as far as both go.
+"""CTSimU scenarios (format 1.0 to 1.2) as runs of the virtual scanner; runs as scenarios are in ctsimu_writing.py.
 
 Read: geometry of every frame (drift files too), voltage or spectrum file, filters, windows, spot, scintillator, grey
 values, SNR, unsharpness, lag, mesh samples on the stage, materials with a formula or mass fractions.  What else a
@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 
 from tomopose.errors import FileError, InputError
-from tomopose.exports.ctsimu import from_ctsimu, to_ctsimu
+from tomopose.exports.ctsimu_scenario import from_ctsimu, sample_pose
 from tomopose.exports.panel import Given
 from tomopose.geometry.frames import Frame
-from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
+from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.geometry.scanner import R_WS, Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.reading import reading
 from tomopose.simulation.detector.detector import Detector
-from tomopose.simulation.objects.mesh import MeshSolid, TriangleMesh, read_mesh
+from tomopose.simulation.objects.mesh import MeshSolid, read_mesh
 from tomopose.simulation.physics.materials import MATERIALS, Material, from_formula
 from tomopose.simulation.physics.spectrum import Spectrum, tube_spectrum
 from tomopose.simulation.projector.focal_spot import FWHM_PER_SIGMA, FocalSpot
@@ -37,8 +37,6 @@ STAGE_TO_M = np.diag([-1.0, -1.0, 1.0])
 """The stage's axes are W's turned by 180 degrees about w."""
 SIGMA_PER_RESOLUTION = 2 * math.sqrt(math.log(5) / 2) / math.pi
 """sigma of a Gaussian over its basic spatial resolution b: modulation 20 % at 1 / (2 b) (ISO 19232-5)."""
-ANODE_DENSITY = 10.0
-"""g/cm3 of an anode whose material is not in the table: no spectrum depends on it."""
 NOT_READ = (
     ("source", "spot", "intensity_map", "file"),
     ("detector", "unsharpness", "mtf"),
@@ -100,15 +98,22 @@ def _run(content: Mapping[str, Any], folder: Path, seed: int) -> SimulatedRun:
         name = _word(content, *path)
         if name is not None:
             raise InputError(f"CTSimU: {'.'.join(path)} ({name}) is not read by the virtual scanner")
+    # Images show the scanner as it is, not as a reconstruction knows it.
+    content = _all_known(content)
     scanner, T_MH = _geometry(from_ctsimu(content, Given(folder=folder)))
     materials = dict(MATERIALS)
     for entry in content.get("materials") or ():
-        materials[str(entry["id"])] = _material(entry)
+        # A vacuum (density 0, often without a formula) fills what is empty anyway.
+        if _number(entry, "density") != 0:
+            materials[str(entry["id"])] = _material(entry)
     poses = PoseSequence(T_MH=T_MH, pose_id=tuple(str(k) for k in range(len(T_MH))), source="set")
     meshes = tuple(_sample(entry, folder) for entry in content.get("samples") or ())
     for mesh in meshes:
         if mesh.material not in materials:
-            raise InputError(f"CTSimU: sample {mesh.name!r} is of material {mesh.material!r}, which is not defined")
+            raise InputError(
+                f"CTSimU: sample {mesh.name!r} is of material {mesh.material!r}, which is not defined "
+                "with a density above 0"
+            )
     return SimulatedRun(
         scanner=scanner,
         poses=poses,
@@ -122,6 +127,15 @@ def _run(content: Mapping[str, Any], folder: Path, seed: int) -> SimulatedRun:
         seed=seed,
         spot=_spot(content),
     )
+
+
+def _all_known(part: Any) -> Any:
+    """The same JSON with every deviation and drift in force, whether a reconstruction knows it or not."""
+    if isinstance(part, list):
+        return [_all_known(p) for p in part]
+    if not isinstance(part, Mapping):
+        return part
+    return {k: True if k == "known_to_reconstruction" and v is False else _all_known(v) for k, v in part.items()}
 
 
 def _geometry(matrices: ProjectionMatrices) -> tuple[Scanner, RigidTransform]:
@@ -160,32 +174,23 @@ def _material(entry: Mapping[str, Any]) -> Material:
     return Material(density=density, fractions=fractions)
 
 
-def _vector(entry: Any, names: str, where: str) -> Any:
-    values = [_number(entry, name) for name in names]
-    if any(v is None for v in values):
-        raise InputError(f"CTSimU: {where} is not given along {', '.join(names)}; samples must be on the stage")
-    return np.array(values, dtype=np.float64)
-
-
 def _sample(entry: Mapping[str, Any], folder: Path) -> MeshSolid:
+    """A mesh in M: the centre of its bounding box, not its file's origin, comes to the sample's centre."""
     name = str(entry.get("name", ""))
-    file, where = entry.get("file"), entry.get("position") or {}
-    file = file.get("value") if isinstance(file, Mapping) else file
+    file = _word(entry, "file")
     if not file:
         raise InputError(f"CTSimU: sample {name!r} names no mesh file")
-    if where.get("deviations"):
-        raise InputError(f"CTSimU: sample {name!r} has deviations, which are not read")
     unit = {"mm": 1.0, "um": 1e-3, "cm": 10.0, "m": 1000.0}.get(str(entry.get("unit", "mm")))
     scale = [_number(entry, "scaling_factor", k, default=1.0) for k in "rst"]
     if unit is None or len(set(scale)) != 1:
         raise InputError(f"CTSimU: sample {name!r} has the unit {entry.get('unit')!r} and scaling {scale}; not read")
-    centre = _vector(where.get("center") or where.get("centre"), "uvw", f"the centre of sample {name!r}")
-    r = _vector(where.get("vector_r"), "uvw", f"vector_r of sample {name!r}")
-    t = _vector(where.get("vector_t"), "uvw", f"vector_t of sample {name!r}")
-    r, t = r / np.linalg.norm(r), t / np.linalg.norm(t)
-    mesh = read_mesh(folder / str(file), scale=unit * float(scale[0] or 1.0))
-    axes = STAGE_TO_M @ np.column_stack([r, np.cross(t, r), t])
-    return MeshSolid(mesh=mesh.placed(R=axes, t=STAGE_TO_M @ centre), material=str(entry.get("material_id")), name=name)
+    centre, axes = sample_pose(entry.get("position") or {}, f"CTSimU: sample {name!r}")
+    mesh = read_mesh(folder / PureWindowsPath(file).as_posix(), scale=unit * float(scale[0] or 1.0))
+    middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+    R = STAGE_TO_M @ axes
+    return MeshSolid(
+        mesh=mesh.placed(R=R, t=STAGE_TO_M @ centre - R @ middle), material=str(entry.get("material_id")), name=name
+    )
 
 
 def _spectrum(content: Mapping[str, Any], materials: Mapping[str, Material], folder: Path) -> Spectrum:
@@ -195,8 +200,8 @@ def _spectrum(content: Mapping[str, Any], materials: Mapping[str, Material], fol
     if voltage is None and file is None:
         raise InputError("CTSimU: source.voltage is missing")
     monochromatic = _get(source, "spectrum", "monochromatic")
-    if file is not None and not monochromatic:
-        # A spectrum's file is that of the tube behind its window: the scenario's plates come on top of it no more.
+    if file is not None:
+        # The format gives a file precedence over `monochromatic`; it holds the tube's spectrum behind its window.
         spectrum = _spectrum_file(folder / PureWindowsPath(file).as_posix())
         source = {**source, "window": None}
     elif monochromatic:
@@ -254,113 +259,20 @@ def _detector(content: Mapping[str, Any], scanner: Scanner) -> Detector:
     part = content.get("detector") or {}
     snr = _number(part, "noise", "snr_at_imax")
     white = _number(part, "gray_value", "imax", default=60000.0) or 60000.0
+    dark = _number(part, "gray_value", "imin", default=0.0) or 0.0
+    if not 0 <= dark < white:
+        raise InputError(f"CTSimU: detector.gray_value.imin is {dark:g} and imax {white:g}; 0 <= imin < imax is needed")
+    # Without a statement about the correction, images are taken as corrected, as a run is written.
+    raw = _get(content, "acquisition", "flat_field", "correction") is False
     resolution = _number(part, "unsharpness", "basic_spatial_resolution", default=0.0) or 0.0
     lag = _number(part, "image_lag", default=0.0) or 0.0
     return Detector(
         snr=math.inf if snr is None else snr,
-        white=white,
+        white=white - dark,
+        dark=dark,
+        output="raw" if raw else "corrected",
+        falloff=raw,
         bits=int(_number(part, "bit_depth", default=16.0) or 16),
         blur_sigma=SIGMA_PER_RESOLUTION * resolution / scanner.p_u,
         lag=(lag,) if lag else (),
     )
-
-
-def run_to_ctsimu(run: SimulatedRun) -> tuple[dict[str, Any], dict[str, TriangleMesh]]:
-    """(scenario content, mesh files by name): geometry by the true poses, meshes in M, tessellated where analytic.
-
-    Tube, filters and scintillator are named where the run knows them; a spectrum from a table has its highest energy
-    for a voltage, and a response from a table is left out.
-    """
-    home = eq5_matrices(run.scanner, T_HT=run.T_HT, T_MH=run.T_MH, alpha=np.asarray(run.poses.alpha))
-    matrices = ProjectionMatrices(
-        P=home,
-        n_u=run.scanner.n_u,
-        n_v=run.scanner.n_v,
-        p_u=run.scanner.p_u,
-        p_v=run.scanner.p_v,
-        pose_id=run.poses.pose_id,
-        scanner=run.scanner,
-    )
-    content = to_ctsimu(matrices)
-    # The scan's volume is fixed to W at home; the bodies are fixed to M.
-    T_MW = run.scanner.T_TW(0.0) @ run.T_HT @ RigidTransform.identity(Frame.M, Frame.H)
-    files: dict[str, TriangleMesh] = {}
-    samples = []
-    for k, (mesh, material, frame) in enumerate(run.tessellated):
-        if frame is not Frame.M:
-            raise InputError(f"a body is fixed to frame {frame.name}; a CTSimU stage carries bodies fixed to M alone")
-        file = f"body-{k}.stl"
-        files[file] = mesh.placed(R=STAGE_TO_M @ T_MW.R, t=STAGE_TO_M @ T_MW.t)
-        axes = {f"vector_{n}": {a: {"value": float(a == b)} for a in "uvw"} for n, b in (("r", "u"), ("t", "w"))}
-        centre = {a: {"value": 0.0, "unit": "mm"} for a in "uvw"}
-        samples.append(
-            {
-                "name": file,
-                "file": file,
-                "unit": "mm",
-                "material_id": material,
-                "position": {"center": centre, **axes, "deviations": []},
-            }
-        )
-    content["samples"] = samples
-    materials = {name: run.materials[name] for name in run.beam_materials}
-    source, scintillator = _source_entry(run.spectrum, run.materials, materials)
-    content["source"] |= source
-    content["materials"] = [_material_entry(name, material) for name, material in materials.items()]
-    if run.spot.shape == "gaussian":
-        content["source"]["spot"] = {
-            "sigma": {
-                "u": {"value": run.spot.size_u / FWHM_PER_SIGMA, "unit": "mm"},
-                "v": {"value": run.spot.size_v / FWHM_PER_SIGMA, "unit": "mm"},
-            }
-        }
-    d = run.detector
-    content["detector"] |= {
-        "type": "real",
-        **scintillator,
-        "bit_depth": {"value": d.bits},
-        "image_lag": {"value": sum(d.lag)},
-        "gray_value": {"imin": {"value": d.dark}, "imax": {"value": d.white}},
-        "noise": {"snr_at_imax": {"value": None if math.isinf(d.snr) else d.snr}},
-        "unsharpness": {
-            "basic_spatial_resolution": {"value": d.blur_sigma * run.scanner.p_u / SIGMA_PER_RESOLUTION, "unit": "mm"}
-        },
-    }
-    return content, files
-
-
-def _source_entry(
-    spectrum: Spectrum, known: Mapping[str, Material], named: dict[str, Material]
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """(source, scintillator) of a scenario; what they are made of joins `named`."""
-
-    def plate(part: tuple[Material | str, float]) -> dict[str, Any]:
-        material, thickness = part
-        name = material if isinstance(material, str) else f"material-{len(named)}"
-        named[name] = known[name] if isinstance(material, str) else material
-        return {"material_id": name, "thickness": {"value": thickness, "unit": "mm"}}
-
-    voltage = float(spectrum.energy[-1]) if spectrum.tube is None else spectrum.tube.voltage
-    source: dict[str, Any] = {
-        "voltage": {"value": voltage, "unit": "kV"},
-        "spectrum": {"monochromatic": False, "file": None},
-        "filters": [plate(part) for part in spectrum.filters],
-    }
-    if spectrum.tube is not None:
-        anode = spectrum.tube.anode
-        named[anode] = known[anode] if anode in known else from_formula(anode, ANODE_DENSITY)
-        angle = {"emission": {"value": spectrum.tube.anode_angle_deg, "unit": "deg"}}
-        source["target"] = {"type": "reflection", "material_id": anode, "angle": angle}
-    part = spectrum.scintillator
-    return source, {} if part is None else {"scintillator": plate(part)}
-
-
-def _material_entry(name: str, material: Material) -> dict[str, Any]:
-    return {
-        "id": name,
-        "name": name,
-        "density": {"value": material.density, "unit": "g/cm^3"},
-        "composition": [
-            {"formula": {"value": e}, "mass_fraction": {"value": f}} for e, f in material.fractions.items()
-        ],
-    }
