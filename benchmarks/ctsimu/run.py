@@ -15,11 +15,13 @@ import math
 import re
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from ctsimu.evaluation import test2D_HS_1
+from ctsimu.primitives import Vector
 from ctsimu.toolbox import Toolbox
 from images import opaque, run_of, scenario, wedge_materials, wedge_run, wedge_scanner, write
 from samples import StepWedge, duplex_wires, half_plane_edge, hole_foil
@@ -61,6 +63,20 @@ class Place:
 
     def result(self, test: str, name: str) -> str:
         return (self.folder / f"{test}-results" / name).read_text()
+
+
+@contextlib.contextmanager
+def plain_numbers() -> Iterator[None]:
+    """2D-HS-1 of ctsimu 1.7 multiplies a string by a NumPy Boolean, which NumPy 2 refuses: for the time of the test its
+    distances, angles and means are Python numbers. No value changes."""
+    distance, angle, mean = Vector.distance, Vector.angle, test2D_HS_1.list_mean_and_stddev
+    Vector.distance = lambda *args: float(distance(*args))
+    Vector.angle = lambda *args: float(angle(*args))
+    test2D_HS_1.list_mean_and_stddev = lambda values: tuple(float(x) for x in mean(values))
+    try:
+        yield
+    finally:
+        Vector.distance, Vector.angle, test2D_HS_1.list_mean_and_stddev = distance, angle, mean
 
 
 def number(text: str, label: str) -> float:
@@ -106,7 +122,9 @@ def falloff(place: Place) -> list[Row]:
 def placement(place: Place) -> list[Row]:
     content = scenario("2D-HS-1_2021-03-24v02r00dp.json")
     run = run_of(content, place.folder, hole_foil(content))
-    place.evaluate("2D-HS-1", write(place.folder, "foil", run, threads=place.threads))
+    file = write(place.folder, "foil", run, threads=place.threads)
+    with plain_numbers():
+        place.evaluate("2D-HS-1", file)
     text = place.result("2D-HS-1", "2D-HS-1_summary.txt")
     scale, turn = number(text, "Mean scale deviation:"), number(text, "Mean rotation angle:")
     shift = [float(x) for x in re.findall(r"[-+0-9.e]+", text.split("Mean translation vector [px]:")[1])[:2]]

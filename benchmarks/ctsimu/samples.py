@@ -29,6 +29,8 @@ STEP = 1000 / 11
 HOLES = ((-160, -140), *((y, z) for z in (205, 0, -205) for y in (205, 0, -205)))
 """Centres (y, z) of the holes' shadows on the panel before scanner and foil are turned, mm; the first hole is large."""
 EDGE_ANGLE = math.radians(3)
+LEFT, RIGHT = 420.0, 600.0
+"""Sides of the wedges in the image, px: the tests look at x = 450 to 565, and a narrow wedge is imaged faster."""
 
 
 def meshed(shape: Shape, segments: int = 256) -> TriangleMesh:
@@ -134,12 +136,12 @@ class StepWedge:
         return shape & (outer - inner)
 
     def whole(self, material: str) -> tuple[Solid, ...]:
-        return tuple(Solid(shape=self.step(k, STEP, 10 * STEP), material=material, frame=Frame.W) for k in range(1, 10))
+        return tuple(Solid(shape=self.step(k, LEFT, RIGHT), material=material, frame=Frame.W) for k in range(1, 10))
 
     def halves(self, left: str, right: str) -> tuple[Solid, ...]:
         """2D-SW-3: a left piece with a straight edge at x = 500; a right piece that leaves a gap above, touches in the
         middle and displaces the left piece below."""
-        first = [Solid(shape=self.step(k, STEP, 500.0), material=left, frame=Frame.W) for k in range(1, 10)]
+        first = [Solid(shape=self.step(k, LEFT, 500.0), material=left, frame=Frame.W) for k in range(1, 10)]
 
         def bevel(y: float) -> float:
             if y < 4 * STEP:
@@ -148,7 +150,7 @@ class StepWedge:
 
         second = [
             Solid(
-                shape=self.step(k, (bevel((10 - k) * STEP), bevel((11 - k) * STEP)), 10 * STEP),
+                shape=self.step(k, (bevel((10 - k) * STEP), bevel((11 - k) * STEP)), RIGHT),
                 material=right,
                 frame=Frame.W,
             )

@@ -24,6 +24,8 @@ from tomopose.io.images.raw import RawLayout, open_raw
 from tomopose.io.images.sequence import ImageSequence, Rows
 from tomopose.io.images.stated import contradictions
 from tomopose.io.images.tiff import open_tiff
+from tomopose.io.images.xim import open_xim
+from tomopose.io.images.xradia import XradiaSource, open_xradia
 from tomopose.reading import reading
 
 SUFFIXES = {
@@ -36,6 +38,9 @@ SUFFIXES = {
     ".hdf5": "HDF5",
     ".nxs": "HDF5",
     ".hdf": "HDF5",
+    ".txrm": "Xradia",
+    ".xrm": "Xradia",
+    ".xim": "XIM",
     ".raw": "RAW",
     ".bin": "RAW",
 }
@@ -48,7 +53,14 @@ REFUSED = {
     ".webp": "WebP",
     ".jp2": "JPEG 2000",
 }
-MAGIC = ((b"II*\0", "TIFF"), (b"MM\0*", "TIFF"), (b"II+\0", "TIFF"), (b"MM\0+", "TIFF"), (b"\x89HDF", "HDF5"))
+MAGIC = (
+    (b"II*\0", "TIFF"),
+    (b"MM\0*", "TIFF"),
+    (b"II+\0", "TIFF"),
+    (b"MM\0+", "TIFF"),
+    (b"\x89HDF", "HDF5"),
+    (b"VMS.XI", "XIM"),
+)
 SHOWN = 5
 
 Source = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
@@ -71,7 +83,7 @@ def open_images(
     ----------
     source:      a folder, a file, a glob pattern, or a list of files.  Folders and patterns are taken in natural order
                  (pose_2 before pose_10), lists as they are.  TIFF (single, multi-page, ImageJ), HDF5 and NXtomo,
-                 DICOM; RAW with `raw_layout`.
+                 DICOM, Zeiss .xrm and .txrm, Varian .xim; RAW with `raw_layout`.
     scanner:     checks the image size and gives the row order, if `rows` does not.
     dark, flat:  images[v, u], or files of them, which are averaged; with them images are transmission
                  T = (I - D) / (F - D), float32.  Flat and dark frames inside an NXtomo file are used if none are given.
@@ -118,7 +130,7 @@ def open_images(
         notes += endianness_note(plain[0], frames.names[0])
     bad = None if bad_pixels is None else _mask(bad_pixels, frames.shape)
     D, F = _mean(dark, order, raw_layout), _mean(flat, order, raw_layout)
-    if isinstance(frames, Hdf5Source) and D is None and F is None and frames.flats:
+    if isinstance(frames, Hdf5Source | XradiaSource) and D is None and F is None and frames.flats:
         turn = slice(None, None, -1) if order == "top-first" else slice(None)
         D, F = (None if m is None else m[turn] for m in (frames.mean(frames.darks), frames.mean(frames.flats)))
         notes.append(f"{len(frames.flats)} flat and {len(frames.darks)} dark frames of the file were used")
@@ -212,6 +224,10 @@ def _open(paths: list[Path], kind: str, raw_layout: RawLayout | None, dataset: s
     if kind == "RAW":
         assert raw_layout is not None
         return open_raw(paths, names, raw_layout)
+    if kind == "Xradia":
+        return open_xradia(paths, names)
+    if kind == "XIM":
+        return open_xim(paths, names)
     if len(paths) > 1:
         raise InputError(f"{len(paths)} HDF5 files were found ({names[0]}, {names[1]} ...); give one")
     return open_hdf5(paths[0], names[0], dataset)
