@@ -6,6 +6,8 @@ DetAssemblyInfo/CamPixelSize as dxchange, CIL and mbirjax read them.
 
 from __future__ import annotations
 
+from contextlib import closing
+
 from tomopose.io.foreign.foreign_file import ForeignFile
 from tomopose.io.foreign.kind import Kind
 from tomopose.io.foreign.scanner_draft import ScannerDraft, sensible
@@ -23,7 +25,7 @@ def recognise(file: ForeignFile) -> bool:
 
 def read(file: ForeignFile) -> ScannerDraft:
     """The scanner of an Xradia file.  EngineMissingError where olefile is not installed."""
-    with open_container(file.path) as container, reading(file.path, "Xradia file (truncated?)"):
+    with closing(open_container(file.path)) as container, reading(file.path, "Xradia file (truncated?)"):
         stated = stated_by(container)
         camera = first(container, "<f4", "DetAssemblyInfo/CamPixelSize", "ImageInfo/CamPixelSize")
         width, height, n = (

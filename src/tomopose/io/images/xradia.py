@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, Protocol, cast
 
 import numpy as np
 
@@ -26,7 +27,16 @@ UM = 1e-3
 REFERENCE = "ReferenceData/Image"
 
 
-def open_container(path: Path) -> Any:
+class Container(Protocol):
+    """What is used of olefile.OleFileIO."""
+
+    def exists(self, filename: str) -> bool: ...
+    def get_size(self, filename: str) -> int: ...
+    def openstream(self, filename: str) -> BinaryIO: ...
+    def close(self) -> None: ...
+
+
+def open_container(path: Path) -> Container:
     """The OLE container; EngineMissingError where olefile is not installed, FileError where it is damaged."""
     try:
         import olefile
@@ -36,10 +46,10 @@ def open_container(path: Path) -> Any:
             install_line="pip install 'tomopose[zeiss]'",
         ) from error
     with reading(path, "Xradia file (truncated?)"):
-        return olefile.OleFileIO(str(path))
+        return cast(Container, olefile.OleFileIO(str(path)))
 
 
-def numbers(container: Any, name: str, kind: str) -> np.ndarray | None:
+def numbers(container: Container, name: str, kind: str) -> np.ndarray | None:
     """A stream of numbers (n,) as float64, None where it is missing."""
     if not container.exists(name):
         return None
@@ -48,7 +58,7 @@ def numbers(container: Any, name: str, kind: str) -> np.ndarray | None:
     return np.frombuffer(raw[: len(raw) // size * size], kind).astype(np.float64)
 
 
-def first(container: Any, kind: str, *names: str) -> float | None:
+def first(container: Container, kind: str, *names: str) -> float | None:
     """The first number of the first of these streams that is there."""
     for name in names:
         values = numbers(container, name, kind)
@@ -57,7 +67,7 @@ def first(container: Any, kind: str, *names: str) -> float | None:
     return None
 
 
-def stated_by(container: Any) -> Stated:
+def stated_by(container: Container) -> Stated:
     """Distances and pixel pitch, mm: the pitch where the beam meets the detector, not behind an objective."""
     source, detector = (first(container, "<f4", f"ImageInfo/{name}RADistance") for name in ("Sto", "Dto"))
     camera = first(container, "<f4", "DetAssemblyInfo/CamPixelSize", "ImageInfo/CamPixelSize")
@@ -115,7 +125,7 @@ def open_xradia(paths: list[Path], names: list[str]) -> XradiaSource:
     angles: list[float] = []
     stated: Stated | None = None
     for path, name in zip(paths, names, strict=True):
-        with open_container(path) as container, reading(path, "Xradia file"):
+        with closing(open_container(path)) as container, reading(path, "Xradia file"):
             count = int(first(container, "<i4", "ImageInfo/NoOfImages") or 1)
             shape = _shape(container, path)
             streams = [f"ImageData{k // PER_FOLDER + 1}/Image{k + 1}" for k in range(count)]
@@ -142,14 +152,14 @@ def open_xradia(paths: list[Path], names: list[str]) -> XradiaSource:
     )
 
 
-def _shape(container: Any, path: Path) -> tuple[int, int]:
+def _shape(container: Container, path: Path) -> tuple[int, int]:
     n_v, n_u = (first(container, "<i4", f"ImageInfo/Image{side}") for side in ("Height", "Width"))
     if not n_v or not n_u or min(n_v, n_u) < 1:
         raise FileError(f"{path} is no Xradia radiograph: ImageInfo/ImageWidth and ImageHeight are missing", path=path)
     return int(n_v), int(n_u)
 
 
-def _type(container: Any, stream: str, shape: tuple[int, int], path: Path) -> np.dtype[Any]:
+def _type(container: Container, stream: str, shape: tuple[int, int], path: Path) -> np.dtype[Any]:
     """The pixels' type, by the stream's length; it must be the one that DataType states."""
     kind = "ReferenceData" if stream == REFERENCE else "ImageInfo"
     said = first(container, "<i4", f"{kind}/DataType")
@@ -167,7 +177,7 @@ def _type(container: Any, stream: str, shape: tuple[int, int], path: Path) -> np
 
 
 @functools.lru_cache(maxsize=2)
-def _open(path: Path, size: int, modified: int) -> Any:
+def _open(path: Path, size: int, modified: int) -> Container:
     return open_container(path)
 
 
