@@ -20,7 +20,7 @@ from twin_cases import twin_experiment, twin_scan_error
 
 from tomopose import BallObservations, Frame, PoseSequence, RigidTransform
 from tomopose.calibration.arrangements.moving_scanner import calibrate_inverse
-from tomopose.calibration.arrangements.multi_sphere import poses_of_views
+from tomopose.calibration.arrangements.multi_sphere.view_pose import poses_of_views
 from tomopose.calibration.arrangements.twin_robots import calibrate_twin
 from tomopose.calibration.identified.calibrate import calibrate_kinematic
 from tomopose.calibration.projection_matrices import projection_matrices

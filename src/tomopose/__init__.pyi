@@ -2,8 +2,8 @@
 
 from . import errors as errors
 from .calibration.arrangements.moving_scanner import calibrate_inverse as calibrate_inverse
-from .calibration.arrangements.multi_sphere import BallPose as BallPose
-from .calibration.arrangements.multi_sphere import pose_from_balls as pose_from_balls
+from .calibration.arrangements.multi_sphere.view_pose import BallPose as BallPose
+from .calibration.arrangements.multi_sphere.view_pose import pose_from_balls as pose_from_balls
 from .calibration.arrangements.turntable import calibrate_turntable as calibrate_turntable
 from .calibration.arrangements.turntable import diagnose_turntable as diagnose_turntable
 from .calibration.arrangements.twin_diagnosis import diagnose_twin as diagnose_twin

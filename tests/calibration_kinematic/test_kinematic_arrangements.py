@@ -12,7 +12,8 @@ from manipulator_cases import SCANNER, Experiment, experiment, hexapod_experimen
 
 from tomopose import BallObservations, Frame, PoseSequence, RigidTransform, Scanner
 from tomopose.calibration.arrangements.moving_scanner import calibrate_inverse, view_distances
-from tomopose.calibration.arrangements.multi_sphere import pose_from_balls, poses_of_views, self_calibrated_balls
+from tomopose.calibration.arrangements.multi_sphere.path import self_calibrated_balls
+from tomopose.calibration.arrangements.multi_sphere.view_pose import pose_from_balls, poses_of_views
 from tomopose.calibration.checks.cross_validation import blocks_of
 from tomopose.calibration.checks.stability import SIGNIFICANT, movements_of
 from tomopose.calibration.identified.calibrate import calibrate_kinematic
@@ -339,7 +340,7 @@ def test_ball_object_calibrates_itself(scanner: Scanner, rng: np.random.Generato
     C = [np.tile(np.eye(2) * SIGMA**2, (len(BALLS), 1, 1))] * 40
     coarse = BALLS + 0.3 * rng.standard_normal(BALLS.shape)
     length = float(np.linalg.norm(BALLS[0] - BALLS[4]))
-    found, poses = self_calibrated_balls(
+    found = self_calibrated_balls(
         scanner, noisy, coarse, covariance=C, distances={(0, 4): (length, 1e-4)}, ball_sigma=0.3
     )
 
@@ -347,8 +348,8 @@ def test_ball_object_calibrates_itself(scanner: Scanner, rng: np.random.Generato
         return np.linalg.norm(x[:, None] - x, axis=2)
 
     assert np.abs(distances(coarse) - distances(BALLS)).max() > 0.1
-    assert np.abs(distances(found) - distances(BALLS)).max() < 0.004
-    assert len(poses) == 40
+    assert np.abs(distances(found.centres) - distances(BALLS)).max() < 0.004
+    assert len(found.T_MW) == 40
 
 
 def test_balls_without_information_are_refused(scanner: Scanner) -> None:

@@ -68,6 +68,10 @@ class FinderSettings(NamedTuple):
     """Gradient of an edge pixel in standard deviations of the noise: by chance in 1e-8 of pixels."""
     edge_share: float = 0.0045
     """And in the largest gradient: a ball 200 times fainter than a collimator's edge is still found."""
+    most: int = 10
+    """Centres of a level that are looked at, those with most votes."""
+    peaks: int = 3
+    """How many of them one range of radii and one polarity can give."""
 
 
 class RingSettings(NamedTuple):

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tomopose.errors import InputError, ShapeError
+from tomopose.geometry.point_motion import rigid_motion
 from tomopose.geometry.rotations import exp_rotation, log_rotation
 from tomopose.measurement.features.shapes import frame_along
 from tomopose.units import Array, float_array
@@ -48,16 +49,9 @@ class Alignment:
 
 
 def from_points(x_part: Array, x_W: Array) -> Alignment:
-    """Least-squares rigid motion of points (n, 3) onto points (n, 3), by singular values.
-
-    Kabsch, Acta Cryst. A32 (1976) 922.  InputError where the points lie on a line.
-    """
-    a, b = x_part - x_part.mean(axis=0), x_W - x_W.mean(axis=0)
-    if np.linalg.matrix_rank(a, tol=1e-9 * max(float(np.abs(a).max()), 1e-300)) < 2:
-        raise InputError(f"{len(a)} points on a line fix no orientation; give points beside it")
-    u, _, vt = np.linalg.svd(a.T @ b)
-    R = (u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt).T
-    return Alignment(R=R, t=x_W.mean(axis=0) - R @ x_part.mean(axis=0), rule="points, least squares")
+    """Least-squares rigid motion of points (n, 3) onto points (n, 3).  InputError where the points lie on a line."""
+    R, t = rigid_motion(x_part, x_W)
+    return Alignment(R=R, t=t, rule="points, least squares")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -90,6 +90,25 @@ def find_ball(
     return best, tuple(candidates)
 
 
+def find_balls(
+    image: Array, expected_radius: float, aspect: float = 1.0, *, most: int, settings: FinderSettings
+) -> list[Candidate]:
+    """All circles of about the expected radius, px in u, best first; an empty list where there is none.
+
+    most: how many balls there are; image and aspect as in `find_ball`.
+    """
+    # a ball's rim may give two peaks of votes, and shafts and neighbours give some more
+    search = _Search(image, expected_radius, aspect, settings._replace(most=4 * most, peaks=2 * most))
+    central, near, _ = _groups(_levels(image.shape), expected_radius, settings.size_ratio)
+    means: dict[int, Array] = {}
+    coarse: list[Candidate] = []
+    for factor in [*central, *near]:
+        coarse += _on_level(_level(image, factor, means), factor, search)
+    coarse = _distinct(coarse, search)
+    widest = math.log(settings.size_ratio)
+    return [c for c in _finalists(search, coarse, len(coarse)) if abs(math.log(c.radius / expected_radius)) < widest]
+
+
 def _of_its_size(found: list[Candidate], expected: float, others: Sequence[float]) -> list[Candidate]:
     """The candidates whose radius is nearer to the expected one than to that of another ball in the image."""
 
@@ -255,7 +274,9 @@ def _level(image: Array, factor: int, means: dict[int, Array]) -> Array:
 def _on_level(level: Array, factor: int, search: _Search) -> list[Candidate]:
     found = []
     settings, rays = search.settings, tuple(search.settings.rays)
-    noise, centres = circle_centres(level, settings.least_votes, settings.edge_noise, settings.edge_share)
+    noise, centres = circle_centres(
+        level, settings.least_votes, settings.edge_noise, settings.edge_share, settings.most, settings.peaks
+    )
     for u, v, band, polarity, _votes in centres.tolist():
         (low, high), sign = BANDS[int(band)], -1.0 if polarity == 1 else 1.0
         yes, x, y, radius, complete, visible, contrast = check_circle(

@@ -9,8 +9,6 @@ from numba import njit
 
 from tomopose.detection.order_statistics import select
 
-MOST, PEAKS = 10, 3
-"""Centres of a level that are looked at, those with most votes, and how many of them a band and polarity can give."""
 SMALLEST, LARGEST = 3.4, 14.5
 """Radii, in px of a level, that are looked for on it; levels follow by factors of 2."""
 BANDS = ((3.4, 5.6), (5.6, 9.0), (9.0, 14.5))
@@ -82,19 +80,19 @@ def _votes(image, square, threshold):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _peaks(votes, reach, least):  # type: ignore[no-untyped-def]
-    """(n, 3): u, v, votes of the highest local maxima of votes summed over (2 reach + 1)^2 pixels."""
+def _peaks(votes, reach, least, most):  # type: ignore[no-untyped-def]
+    """(n, 3), n <= most: u, v, votes of the highest local maxima of votes summed over (2 reach + 1)^2 pixels."""
     rows, columns = votes.shape
     total = np.zeros((rows, columns), np.float32)
     for j in range(rows):
         for i in range(columns):
             if votes[j, i] != 0.0:
                 total[max(0, j - reach) : j + reach + 1, max(0, i - reach) : i + reach + 1] += votes[j, i]
-    out = np.zeros((PEAKS, 3))
+    out = np.zeros((most, 3))
     for j in range(rows):
         for i in range(columns):
             here = total[j, i]
-            if here >= least and here > out[PEAKS - 1, 2] and _is_highest(total, i, j):
+            if here >= least and here > out[most - 1, 2] and _is_highest(total, i, j):
                 _rank(out, np.array([i, j, here]))
     return out[: np.sum(out[:, 2] > 0.0)]
 
@@ -111,13 +109,13 @@ def _is_highest(total, i, j):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def circle_centres(level, least_votes, edge_noise, edge_share):  # type: ignore[no-untyped-def]
+def circle_centres(level, least_votes, edge_noise, edge_share, most, peaks):  # type: ignore[no-untyped-def]
     """(noise of a pixel, (n, 5)): u, v, band, polarity, votes of places that edges point to or away from, most first.
 
     level: float32; the rest: of FinderSettings.  The polarity is 0 for an inside darker than its surroundings, 1
     for a brighter one.
     """
-    found = np.zeros((MOST, 5))
+    found = np.zeros((most, 5))
     if min(level.shape) < 9:
         return 0.0, found[:0]
     square = _gradient_square(level)
@@ -131,7 +129,7 @@ def circle_centres(level, least_votes, edge_noise, edge_share):  # type: ignore[
         votes = _votes(level, square, threshold)
         for polarity in range(2):
             for band in range(len(BANDS)):
-                for u, v, count in _peaks(votes[polarity, band], 1 if band == 0 else 2, least_votes):
+                for u, v, count in _peaks(votes[polarity, band], 1 if band == 0 else 2, least_votes, peaks):
                     _rank(found, np.array([u, v, band, polarity, count]))
     return math.sqrt(noise), found[: np.sum(found[:, 4] > 0.0)]
 

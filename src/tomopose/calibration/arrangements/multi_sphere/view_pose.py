@@ -1,8 +1,4 @@
-"""The multi-sphere method (paper ref. [8]): every view's pose from several balls of a known object, view by view.
-
-Nothing is asked of the manipulator, so its errors do not matter, but the scan must be repeated with the ball object.
-With this and `calibrate` on the same scan, both methods can be compared.  Where the object's coordinates are not
-calibrated, `self_calibrated_balls` finds them from the same views; one known distance then gives the scale.
+"""The pose of an object of several balls in one view (paper ref. [8]), from identified centres.
 
 Source: weighted perspective-n-point by Gauss-Newton from the best of several coarse starts (Hartley & Zisserman,
 Multiple View Geometry, ch. 7), eq. (6) with one T_MT a view.
@@ -10,14 +6,15 @@ Multiple View Geometry, ch. 7), eq. (6) with one T_MT a view.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import permutations, product
 from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.model.ball_projection import projection_blocks, whiteners
+from tomopose.calibration.arrangements.multi_sphere.standard import FEWEST_BALLS
+from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks, whiteners
 from tomopose.errors import InputError, NotConvergedError, NotObservableError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import exp_rotation, skew
@@ -25,12 +22,9 @@ from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
 
-FEWEST_BALLS = 4
-"""Three balls leave up to four poses."""
 STEPS, START_STEPS = 60, 12
 TOLERANCE = 1e-10
 LARGEST_CONDITION = 1e10
-GAUGE = 6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,17 +98,21 @@ def _coarse_starts(scanner: Scanner, x_D: Array, balls: Array) -> list[RigidTran
     return [RigidTransform(R=R, t=x_W - R @ middle, source=Frame.M, target=Frame.W) for R in turns]
 
 
-def _rows(scanner: Scanner, T: RigidTransform, balls: Array) -> tuple[Array, Array, Array]:
-    """Projected balls (m, 2), J (m, 2, 6) by (w, t) of the pose, G_M (m, 2, 3) by the balls."""
-    m = len(balls)
+def view_rows(
+    scanner: Scanner, T: RigidTransform, points: Array, names: Sequence[str] = ()
+) -> tuple[Array, Array, Array, Array]:
+    """x (k, 2) px of points (k, 3) of M, and its derivatives: (k, 2, 6) by (w, t) of the pose, (k, 2, 3) by the points,
+    (k, 2, q) by the scanner's values of those names."""
+    k = len(points)
     same = RigidTransform(
-        R=np.broadcast_to(T.R, (m, 3, 3)), t=np.broadcast_to(T.t, (m, 3)), source=Frame.M, target=Frame.H
+        R=np.broadcast_to(T.R, (k, 3, 3)), t=np.broadcast_to(T.t, (k, 3)), source=Frame.M, target=Frame.H
     )
-    b = projection_blocks(scanner, T_HT=RigidTransform.identity(Frame.H, Frame.T), T_MH=same, t=balls)
-    return b.x_D, np.concatenate([-b.G_H @ skew(b.x_H - T.t), b.G_H], axis=2), b.J_t
+    b = projection_blocks(scanner, T_HT=RigidTransform.identity(Frame.H, Frame.T), T_MH=same, t=points)
+    J = np.concatenate([-b.G_H @ skew(b.x_H - T.t), b.G_H], axis=2)
+    return b.x_D, J, b.J_t, b.J_scanner[:, :, [SCANNER_COLUMNS.index(n) for n in names]]
 
 
-def _moved(T: RigidTransform, step: Array) -> RigidTransform:
+def moved(T: RigidTransform, step: Array) -> RigidTransform:
     return RigidTransform(R=exp_rotation(step[:3]) @ T.R, t=T.t + step[3:], source=T.source, target=T.target)
 
 
@@ -122,7 +120,7 @@ def _gauss_newton(
     scanner: Scanner, x_D: Array, balls: Array, W: Array, T: RigidTransform, steps: int
 ) -> tuple[RigidTransform, float, Array, Array, bool]:
     """Levenberg-Marquardt: (T, chi2, weighted J, residuals px, whether it came to rest)."""
-    x, J, _ = _rows(scanner, T, balls)
+    x, J, *_ = view_rows(scanner, T, balls)
     r = x_D - x
     z = (W @ r[:, :, None]).ravel()
     chi2 = float(z @ z) if np.isfinite(z).all() else np.inf
@@ -134,8 +132,8 @@ def _gauss_newton(
         N = A.T @ A
         N[np.diag_indices(6)] *= 1 + damping
         step = np.asarray(np.linalg.solve(N, A.T @ z), dtype=np.float64)
-        trial = _moved(T, step)
-        x, J, _ = _rows(scanner, trial, balls)
+        trial = moved(T, step)
+        x, J, *_ = view_rows(scanner, trial, balls)
         z_new = (W @ (x_D - x)[:, :, None]).ravel()
         chi2_new = float(z_new @ z_new) if np.isfinite(z_new).all() else np.inf
         if chi2_new <= chi2 * (1 + 1e-12) + 1e-18:
@@ -149,6 +147,16 @@ def _gauss_newton(
                 still = True
                 break
     return T, chi2, A, r, still
+
+
+def refined_pose(scanner: Scanner, x_D: Array, balls: Array, start: RigidTransform) -> RigidTransform | None:
+    """The pose near `start` that is exact for three balls; None where there is none."""
+    W = np.tile(np.eye(2), (len(balls), 1, 1))
+    try:
+        T, chi2, *_ = _gauss_newton(scanner, x_D, balls, W, start, START_STEPS)
+    except np.linalg.LinAlgError:
+        return None
+    return T if chi2 < 1.0 else None
 
 
 def poses_of_views(
@@ -170,61 +178,3 @@ def poses_of_views(
             pose = pose_from_balls(scanner, x[seen], balls[seen], covariance=C)
         found.append(pose)
     return found
-
-
-def self_calibrated_balls(
-    scanner: Scanner,
-    views: Sequence[Any],
-    balls: Any,
-    *,
-    covariance: Sequence[Any] | None = None,
-    distances: Mapping[tuple[int, int], tuple[float, float]] | None = None,
-    ball_sigma: float = 1.0,
-) -> tuple[Array, list[BallPose]]:
-    """Ball coordinates (m, 3) and the views' poses together, from coarse coordinates.
-
-    distances: (row, row) -> (distance, standard uncertainty), mm; ball_sigma: mm, how far the coarse coordinates may be
-    off.  Without a distance the object's size is known only as well as ball_sigma: radiographs of one scanner position
-    cannot distinguish a large object far away from a small one near.
-    """
-    balls = np.array(balls, dtype=np.float64)
-    nominal = balls.copy()
-    bars = dict(distances or {})
-    poses = poses_of_views(scanner, views, balls, covariance=covariance)
-    T = [p.T_MW for p in poses]
-    m = len(balls)
-    for _ in range(STEPS):
-        S = np.eye(3 * m) / ball_sigma**2
-        g = (nominal - balls).ravel() / ball_sigma**2
-        for (a, b), (length, u) in bars.items():
-            d = balls[a] - balls[b]
-            row = np.zeros(3 * m)
-            row[3 * a : 3 * a + 3], row[3 * b : 3 * b + 3] = d, -d
-            row /= np.linalg.norm(d) * u
-            S += np.outer(row, row)
-            g += row * (length - np.linalg.norm(d)) / u
-        eliminated = []
-        for k, view in enumerate(views):
-            x = np.asarray(view, dtype=np.float64)
-            seen = np.flatnonzero(np.isfinite(x).all(axis=1))
-            C = np.tile(np.eye(2), (len(seen), 1, 1)) if covariance is None else np.asarray(covariance[k])[seen]
-            W = whiteners(C)
-            calc, J, G = _rows(scanner, T[k], balls[seen])
-            A = (W @ J).reshape(-1, 6)
-            by_ball = np.zeros((len(seen), 2, m, 3))
-            by_ball[np.arange(len(seen)), :, seen] = W @ G
-            B = by_ball.reshape(-1, 3 * m)
-            z = (W @ (x[seen] - calc)[:, :, None]).ravel()
-            N, NB, Nz = A.T @ A, A.T @ B, A.T @ z
-            S += B.T @ B - NB.T @ np.linalg.solve(N, NB)
-            g += B.T @ z - NB.T @ np.linalg.solve(N, Nz)
-            eliminated.append((N, NB, Nz))
-        step = np.linalg.solve(S, g)
-        balls = balls + step.reshape(m, 3)
-        T = [
-            _moved(T_k, np.asarray(np.linalg.solve(N, Nz - NB @ step), dtype=np.float64))
-            for T_k, (N, NB, Nz) in zip(T, eliminated, strict=True)
-        ]
-        if np.abs(step).max() < 1e-9:
-            return balls, poses_of_views(scanner, views, balls, covariance=covariance)
-    raise NotConvergedError(f"the ball object's coordinates still move by {np.abs(step).max():.3g} mm at the last step")
