@@ -2,6 +2,14 @@
 
 from . import errors as errors
 from .calibration.arrangements.moving_scanner import calibrate_inverse as calibrate_inverse
+from .calibration.arrangements.multi_sphere.calibrate import calibrate_multi_sphere as calibrate_multi_sphere
+from .calibration.arrangements.multi_sphere.identify import Circles as Circles
+from .calibration.arrangements.multi_sphere.identify import MeasuredBall as MeasuredBall
+from .calibration.arrangements.multi_sphere.path import BallView as BallView
+from .calibration.arrangements.multi_sphere.path import PathSolution as PathSolution
+from .calibration.arrangements.multi_sphere.path import SharedValues as SharedValues
+from .calibration.arrangements.multi_sphere.result import MultiSphereCalibration as MultiSphereCalibration
+from .calibration.arrangements.multi_sphere.standard import SphereStandard as SphereStandard
 from .calibration.arrangements.multi_sphere.view_pose import BallPose as BallPose
 from .calibration.arrangements.multi_sphere.view_pose import pose_from_balls as pose_from_balls
 from .calibration.arrangements.turntable import calibrate_turntable as calibrate_turntable
@@ -48,6 +56,8 @@ from .detection.image import detect_image as detect_image
 from .detection.reading import Radiograph as Radiograph
 from .detection.result import BallImage as BallImage
 from .detection.run.detect import detect as detect
+from .detection.run.many_balls import BallsInImage as BallsInImage
+from .detection.run.many_balls import detect_balls as detect_balls
 from .detection.settings import DetectionSettings as DetectionSettings
 from .detection.settings import FinderSettings as FinderSettings
 from .detection.settings import FitSettings as FitSettings
@@ -89,6 +99,9 @@ from .io.images.writing import write_hdf5 as write_hdf5
 from .io.images.writing import write_tiff as write_tiff
 from .io.matrices_npz import read_matrices as read_matrices
 from .io.matrices_npz import write_matrices as write_matrices
+from .io.multi_sphere.result_json import write_multi_sphere as write_multi_sphere
+from .io.multi_sphere.standard_csv import read_standard as read_standard
+from .io.multi_sphere.standard_csv import write_standard as write_standard
 from .io.observations_csv import read_observations as read_observations
 from .io.observations_csv import write_observations as write_observations
 from .io.pairing import pair_images as pair_images

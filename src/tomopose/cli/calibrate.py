@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from tomopose.cli.common import PosesOption, ScannerOption, SourcePosesOption, arguments, either, names
-from tomopose.cli.options import ObservedOptions, SpokenOptions, WritingOptions, add_command
+from tomopose.cli.calibrate_multi_sphere import calibrate_multi_sphere
+from tomopose.cli.calibration_options import CalibrationOptions, Options, repeatability_of
+from tomopose.cli.common import arguments, either, names
+from tomopose.cli.options import add_command
 
 if TYPE_CHECKING:
     from tomopose import BallObservations, Calibration, PoseSequence, Scanner, TwinRobots
-    from tomopose.manipulator.real_poses import Repeatability
     from tomopose.manipulator.twin_file import TwinDrawing
 
 EPILOG = (
@@ -24,109 +24,17 @@ EPILOG = (
     "poses.csv --observations observations.csv --out cal/\n\n"
     "Twin robots: tomopose calibrate --twin twin.json --poses detector.csv --source-poses source.csv --scanner "
     "scanner.json --observations observations.csv --out cal/\n\n"
-    "A table that turns alone: tomopose calibrate --arrangement turntable --scanner scanner.json --poses poses.csv "
-    "--observations observations.csv --out cal/"
+    "Multi-sphere: tomopose calibrate --method multi-sphere --standard standard.csv --scanner scanner.json --poses "
+    "scan.csv --images standard_radiographs/ --out path/"
 )
-ARRANGEMENTS = ("moving-object", "moving-scanner", "turntable")
-METHODS = ("poses", "turntable")
+METHODS = ("single-sphere", "multi-sphere")
+ARRANGEMENTS = ("moving-object", "moving-scanner")
 
 SCALE_BAR = re.compile(r"(?P<a>\d+),(?P<b>\d+)=(?P<mm>\d+\.?\d*)\((?P<u>\d*\.?\d+)\)")
 
 
 def register(app: typer.Typer) -> None:
     add_command(app, "calibrate", calibrate, epilog=EPILOG)
-
-
-@dataclass(frozen=True, kw_only=True)
-class CalibrationOptions(ObservedOptions, SpokenOptions):
-    """Everything that says what is calibrated and how; `diagnose` takes the same."""
-
-    scanner: ScannerOption
-    poses: PosesOption
-    ball_diameter: Annotated[
-        float | None,
-        typer.Option(
-            "--ball-diameter-mm",
-            min=0.0,
-            help="Diameter of the ball, mm; with observations that hold semi axes it checks the magnification.",
-        ),
-    ] = None
-    manipulator: Annotated[
-        Path | None, typer.Option("--manipulator", help="hexapod.json or robot.json: nominal geometry and its priors.")
-    ] = None
-    model: Annotated[
-        str, typer.Option("--model", help="auto, rigid, kinematic or slack: how the manipulator may err.")
-    ] = "auto"
-    free: Annotated[
-        str,
-        typer.Option(
-            "--free",
-            help="Scanner values to estimate without a prior, e.g. d_SR,u_0; auto: those whose stated or assumed sigma "
-            "the images contradict; none: none.",
-        ),
-    ] = "auto"
-    fix: Annotated[
-        str | None, typer.Option("--fix", help="Parameters to hold although scanner.json gives them a sigma.")
-    ] = None
-    repeatability: Annotated[
-        str | None,
-        typer.Option(
-            "--repeatability-um-urad",
-            help="The maker's repeatability of the manipulator, 1 sigma, as 0.5,12: prior of its scatter.",
-        ),
-    ] = None
-    distance: Annotated[
-        list[str] | None,
-        typer.Option("--distance", help="Scale bar between two balls, ID,ID=MM(U), as in 0,1=25.000(0.001)."),
-    ] = None
-    arrangement: Annotated[
-        str,
-        typer.Option(
-            "--arrangement",
-            help="What the manipulator carries: moving-object, or moving-scanner (source "
-            "and detector; C-arm, gantry), where the ball does not move; turntable: nothing moves but the table.",
-        ),
-    ] = "moving-object"
-    method: Annotated[
-        str, typer.Option("--method", help="poses, or turntable: the same as --arrangement turntable.")
-    ] = "poses"
-    from_pose: Annotated[
-        str | None, typer.Option("--from-pose", help="Use the poses of the table from this pose_id on.")
-    ] = None
-    until_pose: Annotated[
-        str | None, typer.Option("--until-pose", help="Use the poses before this pose_id, which is left out.")
-    ] = None
-    distance_sigma: Annotated[
-        float,
-        typer.Option(
-            "--d-sd-sigma-mm",
-            min=0.0,
-            help="With moving-scanner: scatter of d_SD from view to view, one "
-            "more number a view; 0: source and detector are fixed to one another.",
-        ),
-    ] = 0.0
-    twin: Annotated[
-        Path | None,
-        typer.Option(
-            "--twin", help="twin.json: source and detector on a robot each; --poses is then the detector's table."
-        ),
-    ] = None
-    source_poses: SourcePosesOption = None
-
-    @property
-    def moving_scanner(self) -> bool:
-        return self.arrangement == "moving-scanner"
-
-    @property
-    def turntable(self) -> bool:
-        return "turntable" in (self.arrangement, self.method)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Options(CalibrationOptions, WritingOptions):
-    """The options of `tomopose calibrate`."""
-
-    out: Annotated[Path, typer.Option("--out", help="Folder for calibration.json, observations.csv, report.html.")]
 
 
 def scale_bars(texts: list[str] | None) -> dict[tuple[int, int], tuple[float, float]] | None:
@@ -232,19 +140,6 @@ def twin_robots(o: CalibrationOptions, given: Inputs) -> TwinRobots:
     return given.twin.robots(tp.read_poses(o.source_poses, forward=forward_of(given.twin.source)))
 
 
-def repeatability_of(text: str | None) -> Repeatability | None:
-    """`0.5,12` (um, urad) as a Repeatability."""
-    from tomopose.manipulator.real_poses import Repeatability
-
-    if text is None:
-        return None
-    try:
-        t_um, w_urad = (float(part) for part in text.split(","))
-    except ValueError:
-        raise typer.BadParameter(f"{text!r} is not UM,URAD", param_hint="--repeatability-um-urad") from None
-    return Repeatability(t_mm=t_um * 1e-3, w_rad=w_urad * 1e-6)
-
-
 def solve(o: Options, given: Inputs) -> Calibration:
     """The calibration of the arrangement; where no optimum was reached, what was reached (it is rejected)."""
     import tomopose as tp
@@ -292,6 +187,12 @@ def calibrate(options: Options) -> int:
     from tomopose.provenance import provenance
 
     o = options
+    if o.method not in METHODS:
+        raise typer.BadParameter(f"{o.method!r} is unknown; choose one of {', '.join(METHODS)}", param_hint="--method")
+    if o.method == "multi-sphere":
+        return calibrate_multi_sphere(o)
+    if o.standard is not None:
+        raise typer.BadParameter("belongs to --method multi-sphere", param_hint="--standard")
     either(o.images, o.observations)
     require_arrangement(o)
     require_free_folder(o.out, force=o.force)

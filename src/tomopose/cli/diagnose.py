@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from tomopose.cli.calibrate import CalibrationOptions, Inputs, read_inputs, require_arrangement, twin_robots
+from tomopose.cli.calibrate import Inputs, read_inputs, require_arrangement, twin_robots
+from tomopose.cli.calibration_options import CalibrationOptions
 from tomopose.cli.common import NOT_TRUSTWORTHY, OK, either, names
 from tomopose.cli.options import add_command
 

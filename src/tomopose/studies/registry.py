@@ -24,6 +24,7 @@ PAPER: Mapping[str, str] = MappingProxyType(
         "figure9": "Fig. 9",
         "tuy": "Sec. 6.3",
         "section6": "Figs. 11 to 16",
+        "multi_sphere": "Sec. 6.3, ref. [8]",
         "cylinder": "Fig. 12, in principle",
         "improvements": "Sec. 7",
     }

@@ -24,6 +24,7 @@ from tomopose.calibration.result import Calibration
 from tomopose.calibration.uncertainty.trajectory import object_points, rms_px, without_object_pose
 from tomopose.geometry.projection import eq5_matrices
 from tomopose.geometry.rotations import exp_rotation
+from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.hexapod import Hexapod
 from tomopose.manipulator.poses import PoseSequence
@@ -34,6 +35,7 @@ from tomopose.studies.parts.radiographs import BallRun
 from tomopose.trajectory.pose_grid import pose_grid
 from tomopose.trajectory.scan import tilted_scan
 from tomopose.trajectory.tilt import eq11_triangle, sine_tilt
+from tomopose.units import Array
 
 TURNED_AXES = (0.0, 0.79e-3, 2.64e-3)
 """c, rad."""
@@ -98,5 +100,11 @@ def scan_error_um(calibration: Calibration, run: BallRun, magnification: float) 
         T_MH=real_T_MH(scan, magnification),
         alpha=np.zeros(len(scan)) if scan.alpha is None else scan.alpha,
     )
-    d = without_object_pose(projection_matrices(calibration, scan).P, P_true, object_points())
-    return rms_px(d) * float(np.sqrt(run.scanner.p_u * run.scanner.p_v)) / run.scanner.magnification * 1e3
+    return matrices_error_um(projection_matrices(calibration, scan).P, P_true, run.scanner)
+
+
+def matrices_error_um(P: Array, P_true: Array, scanner: Scanner) -> float:
+    """rms error, um at the object, of matrices (n, 3, 4) of the unbinned scanner: corners of +-15, +-15, +-30 mm, the
+    object's rigid pose removed."""
+    d = without_object_pose(P, P_true, object_points())
+    return rms_px(d) * float(np.sqrt(scanner.p_u * scanner.p_v)) / scanner.magnification * 1e3

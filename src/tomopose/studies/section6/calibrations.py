@@ -25,10 +25,10 @@ GRID = 3
 """3 x 3 x 3 x 7 poses, as in table 2."""
 
 
-def planned_run(magnification: float, seed: int, number: int) -> BallRun:
-    """Run `number` at our poses, which are the same in each run: as many as the paper's."""
+def planned_run(magnification: float, seed: int, number: int, n: int | None = None) -> BallRun:
+    """Run `number` at our n poses, which are the same in each run; by default as many as the paper's."""
     base = ball_run(magnification, GRID, seed, number=number)
-    poses = mixed_poses(np.random.default_rng(np.random.SeedSequence([seed, 62])), n=len(base.poses))
+    poses = mixed_poses(np.random.default_rng(np.random.SeedSequence([seed, 62])), n=n or len(base.poses))
     motion, images = np.random.SeedSequence([seed, 63, round(10 * magnification), number]).spawn(2)
     return replace(
         base,

@@ -9,7 +9,7 @@ import numpy as np
 
 from tomopose.calibration.arrangements.multi_sphere.identify import Circles, identify, overlapping
 from tomopose.calibration.arrangements.multi_sphere.mount import find_mount
-from tomopose.calibration.arrangements.multi_sphere.path import PathSolution, View, freed_of, solve_path
+from tomopose.calibration.arrangements.multi_sphere.path import BallView, PathSolution, freed_of, solve_path
 from tomopose.calibration.arrangements.multi_sphere.result import MultiSphereCalibration
 from tomopose.calibration.arrangements.multi_sphere.standard import FEWEST_BALLS, SphereStandard
 from tomopose.calibration.arrangements.multi_sphere.view_pose import pose_from_balls, view_rows
@@ -43,7 +43,7 @@ SYMMETRY_MM = 0.3
 class _Found:
     """One view: what was used, its own pose, and the words about what was not."""
 
-    view: View
+    view: BallView
     T_MW: RigidTransform
     left_out: tuple[str, ...]
 
@@ -141,7 +141,7 @@ def _view_of(
             kept.append(c)
     if len(kept) < FEWEST_BALLS:
         raise InputError(f"{len(kept)} of {len(standard)} balls can be used; at least {FEWEST_BALLS} are needed")
-    view = View(ball=which.ball[kept], x_D=circles.x_D[kept], covariance=circles.covariance[kept])
+    view = BallView(ball=which.ball[kept], x_D=circles.x_D[kept], covariance=circles.covariance[kept])
     T = which.T_MW
     for aside in range(MOST_ASIDE + 1):
         _, _, G, _ = view_rows(scanner, T, standard.centres[view.ball])
@@ -159,7 +159,7 @@ def _view_of(
             f"{np.sqrt(z2[worst]):.3g} standard uncertainties, from where the others place it"
         )
         rest = np.arange(len(view.ball)) != worst
-        view = View(ball=view.ball[rest], x_D=view.x_D[rest], covariance=view.covariance[rest])
+        view = BallView(ball=view.ball[rest], x_D=view.x_D[rest], covariance=view.covariance[rest])
     return _Found(view=view, T_MW=T, left_out=tuple(words))
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Protocol
 
 import numpy as np
 
@@ -37,6 +38,17 @@ CLEAR_PX = 6.0
 """Least distance between the rims of two balls that both count, as in detection."""
 
 
+class MeasuredBall(Protocol):
+    """What detection says of one ball: centre (2,) px, its covariance (2, 2) px^2, radius px."""
+
+    @property
+    def x_D(self) -> Array: ...
+    @property
+    def covariance(self) -> Array: ...
+    @property
+    def radius(self) -> float: ...
+
+
 @dataclass(frozen=True, kw_only=True)
 class Circles:
     """What was measured in one view: x_D (k, 2) px, covariance (k, 2, 2) px^2, radius (k,) px."""
@@ -47,6 +59,15 @@ class Circles:
 
     def __len__(self) -> int:
         return len(self.x_D)
+
+    @classmethod
+    def of(cls, balls: Sequence[MeasuredBall]) -> Circles:
+        """From the balls that detection measured in one radiograph."""
+        return cls(
+            x_D=np.array([b.x_D for b in balls]).reshape(-1, 2),
+            covariance=np.array([b.covariance for b in balls]).reshape(-1, 2, 2),
+            radius=np.array([b.radius for b in balls]),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

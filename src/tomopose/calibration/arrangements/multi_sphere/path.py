@@ -34,7 +34,7 @@ WITHOUT_EFFECT = ("d_SR", "eta", "axis_y", "axis_tilt_x", "axis_tilt_y")
 
 
 @dataclass(frozen=True, kw_only=True)
-class View:
+class BallView:
     """One view: ball (k,) indices into the standard, x_D (k, 2) px, covariance (k, 2, 2) px^2."""
 
     ball: np.ndarray
@@ -75,7 +75,7 @@ def freed_of(assumed: Sequence[Assumed]) -> tuple[Assumed, ...]:
 
 def solve_path(
     scanner: Scanner,
-    views: Sequence[View],
+    views: Sequence[BallView],
     calibrated: Array,
     starts: Sequence[RigidTransform],
     *,
@@ -154,7 +154,7 @@ class _ViewPart:
 
 
 def _view_part(
-    scanner: Scanner, view: View, T: RigidTransform, centres: Array, names: Sequence[str], size: int
+    scanner: Scanner, view: BallView, T: RigidTransform, centres: Array, names: Sequence[str], size: int
 ) -> _ViewPart:
     W = whiteners(view.covariance)
     x, J, J_b, J_s = view_rows(scanner, T, centres[view.ball], names)
@@ -206,5 +206,5 @@ def self_calibrated_balls(
         x = np.asarray(view, dtype=np.float64)
         seen = np.flatnonzero(np.isfinite(x).all(axis=1))
         C = np.tile(np.eye(2), (len(seen), 1, 1)) if covariance is None else np.asarray(covariance[k])[seen]
-        rows.append(View(ball=seen, x_D=x[seen], covariance=C))
+        rows.append(BallView(ball=seen, x_D=x[seen], covariance=C))
     return solve_path(scanner, rows, balls, starts, sigma=np.full(len(balls), ball_sigma), bars=distances)

@@ -8,7 +8,7 @@ from dataclasses import field
 import numpy as np
 
 from tomopose.calibration.arrangements.multi_sphere.identify import view_matrix
-from tomopose.calibration.arrangements.multi_sphere.path import PathSolution, View
+from tomopose.calibration.arrangements.multi_sphere.path import BallView, PathSolution
 from tomopose.calibration.arrangements.multi_sphere.standard import SphereStandard
 from tomopose.calibration.arrangements.multi_sphere.view_pose import view_rows
 from tomopose.calibration.checks.verdict import Finding, Verdict, judge
@@ -44,7 +44,7 @@ class MultiSphereCalibration(Rows):
     given: Scanner
     standard: SphereStandard
     pose_id: tuple[str, ...]
-    views: tuple[View, ...]
+    views: tuple[BallView, ...]
     path: PathSolution
     home: RigidTransform
     alone: Array
