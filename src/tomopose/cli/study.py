@@ -58,7 +58,8 @@ def study(
     say.result(
         {"out": folder.name, **result.to_json()},
         [
-            f"{result.title} ({result.scale}, {result.seconds:.0f} s)",
+            f"{result.title} ({result.scale}, {result.seconds:.0f} s by the clock, {result.processor_seconds:.0f} s of "
+            f"processor time, {result.compile_seconds:.0f} s by the clock for compiling)",
             *(f"  {'holds' if c.holds else 'DOES NOT HOLD'}: {c.statement}: {c.found}" for c in result.checks),
             f"{folder}: study.json, study.html, and {len(result.figures)} figures as PNG",
         ],

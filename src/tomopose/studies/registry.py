@@ -10,6 +10,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from numba.core.event import install_timer
+
 from tomopose.atomic import only_writer
 from tomopose.errors import InputError
 from tomopose.provenance import provenance
@@ -60,8 +62,12 @@ def run_study(
         folder=None if folder is None else Path(folder) / "steps",
         key={"study": name, "scale": scale, "seed": seed},
     )
-    begin = time.perf_counter()
-    with contextlib.nullcontext() if folder is None else only_writer(Path(folder)):
+    begin, worked = time.perf_counter(), time.process_time()
+    compiled: list[float] = []
+    with (
+        install_timer("numba:compile", compiled.append),
+        contextlib.nullcontext() if folder is None else only_writer(Path(folder)),
+    ):
         rows, checks, figures, notes = module.run(scale, seed, steps, progress or (lambda done, total: None))
     return StudyResult(
         name=name,
@@ -75,5 +81,7 @@ def run_study(
         figures=tuple(figures),
         notes=tuple(notes),
         seconds=time.perf_counter() - begin,
+        processor_seconds=time.process_time() - worked,
+        compile_seconds=sum(compiled),
         provenance=provenance(arguments={"study": name, "scale": scale}, seed=seed),
     )

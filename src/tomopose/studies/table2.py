@@ -29,6 +29,8 @@ PRINTED_CHANGE: Mapping[float, tuple[float, ...]] = MappingProxyType(
 LAST_ROW: Mapping[float, int] = MappingProxyType({2.7: 2, 5.3: 4})
 EXPECTED: Mapping[float, tuple[float, float]] = MappingProxyType({2.7: (0.15, 0.16), 5.3: (0.48, 0.51)})
 FLOOR_FACTOR, SCAN_GAIN = 1.3, 3.0
+RUN_TO_RUN = 0.02
+"""Sec. 5.2: "2 % or less"; its own numbers at M 2.7 differ by 2.3 %."""
 
 TITLE = "Table 2: two runs on an erring manipulator"
 QUESTION = (
@@ -116,6 +118,12 @@ def checks_of(magnification: float, runs: tuple[SolvedRun, SolvedRun], rows: lis
     gain = min((r.paper_method or 0.0) / (r.best or np.inf) for r in rows if r.quantity.startswith("error of the"))
     p = compare(runs[0].best, runs[1].best).p_mount
     return [
+        check_below(
+            f"by the paper's method d_rms_opt of both runs differs by 2 % at most, as printed{at}",
+            abs(d[1] / d[0] - 1),
+            RUN_TO_RUN,
+            "",
+        ),
         check_between(
             f"by the paper's method d_rms_opt of both runs is as printed{at}", float(np.mean(d)), low, high, "px"
         ),

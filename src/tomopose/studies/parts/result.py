@@ -59,7 +59,8 @@ class StudyResult:
 
     paper:   which table or figure it repeats.  question: what it asks, in a sentence.
     rows, checks, figures: numbers, statements and pictures.  notes: what differs from the paper, and why.
-    seconds: wall time of this run; what was taken from an earlier, interrupted run is not counted.
+    seconds: wall time of this run; what was taken from an earlier, interrupted run is not counted.  processor_seconds:
+    of this process; compile_seconds: by the clock, while kernels were compiled, 0 where all were kept.
     """
 
     name: str
@@ -73,6 +74,8 @@ class StudyResult:
     figures: tuple[Figure, ...]
     notes: tuple[str, ...]
     seconds: float
+    processor_seconds: float
+    compile_seconds: float
     provenance: Provenance
 
     @property
@@ -102,6 +105,8 @@ class StudyResult:
             "figures": [f.title for f in self.figures],
             "notes": list(self.notes),
             "seconds": self.seconds,
+            "processor_seconds": self.processor_seconds,
+            "compile_seconds": self.compile_seconds,
             "provenance": self.provenance.to_json(),
         }
 

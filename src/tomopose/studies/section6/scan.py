@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
@@ -17,11 +18,12 @@ from tomopose.geometry.rotations import R_y
 from tomopose.geometry.scanner import Scanner
 from tomopose.kept import Key, key_of
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.simulation.detector.scatter_glare_mtf import Scatter, with_scatter
 from tomopose.simulation.objects.mesh import MeshSolid, TriangleMesh
 from tomopose.simulation.objects.specimen import specimen_mesh
 from tomopose.simulation.objects.sphere_standard import BASE_TOP, SHAFT_DIAMETER, sphere_centres, sphere_diameters
 from tomopose.simulation.physics.materials import attenuation
-from tomopose.simulation.physics.spectrum import tube_spectrum
+from tomopose.simulation.physics.spectrum import Beam, condense, tube_spectrum
 from tomopose.studies.demo import demo_setup, paper_scanner
 from tomopose.studies.parts.steps import sources
 from tomopose.studies.parts.virtual_hexapod import real_T_MH, scan_of
@@ -42,6 +44,13 @@ MARGIN_MM = 2.0
 """Air around the object in the volume."""
 SNR_UNBINNED, WHITE = 200.0, 50000.0
 """Of an unattenuated pixel before binning, and what it counts."""
+BLUR_PX = 0.73
+"""Unbinned pixels, standard deviation: 0.7 px of the detector, as for the ball's radiographs, and a focal spot of 10 um
+(standard deviation) seen 4.3 times larger."""
+SCATTER_CONSTANT, SCATTER_AMOUNT, SCATTER_PX = 0.01, 0.1, 200.0
+"""Shares of the open beam and width, unbinned pixels: of the order that scatter has behind 60 mm of aluminium; none of
+it is printed."""
+LONGEST_MM = 80.0
 MOST_KEPT_BYTES = 6e8
 """Frames of smaller scans stay in memory; those of larger ones are kept in a file, where there is a folder for it."""
 
@@ -67,7 +76,10 @@ class Numbers:
 
 @dataclass(frozen=True, kw_only=True)
 class Scan:
-    """One scan: recorded poses, true matrices (binned), the scanner (binned), and the seed of its noise."""
+    """One scan: recorded poses, true matrices (binned), the scanner (binned), and the seed of its noise.
+
+    real_beam: polychromatic, with focal spot, detector blur and scatter; else monochromatic and sharp.
+    """
 
     thing: Object
     path: Path
@@ -78,6 +90,7 @@ class Scan:
     samples: int
     edge: float
     seed: int
+    real_beam: bool = False
 
 
 def specimen(edge: float) -> TriangleMesh:
@@ -141,6 +154,14 @@ def attenuation_of(thing: Object) -> float:
     return float(attenuation(material, np.array([beam.mean_energy]))[0])
 
 
+@functools.cache
+def beam_of(thing: Object) -> Beam:
+    """The tube's spectrum behind its filter, condensed for the object's material."""
+    tube = tube_spectrum(180.0)
+    material, spectrum = ("EN AW-6082", tube.filtered("Cu", 0.25)) if thing == "specimen" else ("ruby", tube)
+    return condense(spectrum, (material,), [LONGEST_MM])
+
+
 def path_maker(scan: Scan) -> Callable[[int], Array]:
     """j -> path lengths in view j, finely sampled: (samples n_v, samples n_u), mm."""
     P = fine_matrices(scan.truth.P, scan.samples)
@@ -169,6 +190,7 @@ class Radiographs(Sequence[Any]):
     def __init__(self, scan: Scan, folder: FilePath | None = None) -> None:
         self.scan, self._paths = scan, path_maker(scan)
         self._mu = attenuation_of(scan.thing)
+        self._beam = beam_of(scan.thing) if scan.real_beam else None
         self._seeds = np.random.SeedSequence(scan.seed).generate_state(len(scan.poses))
         shape = (len(scan.poses), scan.truth.n_v, scan.truth.n_u)
         large = 2 * np.prod(shape) > MOST_KEPT_BYTES
@@ -185,10 +207,17 @@ class Radiographs(Sequence[Any]):
         return len(self.scan.poses)
 
     def transmission(self, j: int) -> Array:
-        """Without noise (n_v, n_u): exp(-mu L) averaged over each pixel."""
+        """Without noise (n_v, n_u): exp(-mu L) averaged over each pixel, or what a real beam makes of it."""
         s, (n_v, n_u) = self.scan.samples, (self.scan.truth.n_v, self.scan.truth.n_u)
-        fine = np.exp(-self._mu * self._paths(j))
-        return np.asarray(fine.reshape(n_v, s, n_u, s).mean(axis=(1, 3)))
+        L = self._paths(j)
+        if self._beam is None:
+            return np.asarray(np.exp(-self._mu * L).reshape(n_v, s, n_u, s).mean(axis=(1, 3)))
+        fine = self._beam.transmission(L.reshape(-1, 1)).reshape(L.shape)
+        blurred = gaussian_filter(fine, BLUR_PX * s / self.scan.binning, mode="nearest")
+        mean = blurred.reshape(n_v, s, n_u, s).mean(axis=(1, 3))
+        return with_scatter(mean, Scatter(
+            constant=SCATTER_CONSTANT, amount=SCATTER_AMOUNT, sigma=SCATTER_PX / self.scan.binning
+        ))  # fmt: skip
 
     def __getitem__(self, j: Any) -> Any:
         # A frame counts 1 at least, and its last pixel is written last: 0 there says that it has not been made.

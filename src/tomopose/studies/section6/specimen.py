@@ -13,6 +13,7 @@ from tomopose.measurement.features.feature import Feature
 from tomopose.measurement.features.fits import fit_plane, fit_sphere
 from tomopose.measurement.features.measurands import distance
 from tomopose.measurement.measure import measure
+from tomopose.measurement.mesh.cmm_correction import corrected_reference
 from tomopose.measurement.mesh.comparison import compare
 from tomopose.measurement.mesh.mesh import Mesh
 from tomopose.measurement.plan import MeasurementPlan, plan_from
@@ -27,6 +28,7 @@ from tomopose.simulation.objects.specimen import (
     FLANGE_RADIUS,
     FLAT,
     LENGTH,
+    specimen_mesh,
 )
 from tomopose.studies.section6.blur import blur_of
 from tomopose.studies.section6.scan import MOUNTED, specimen
@@ -41,13 +43,40 @@ THREAD_Y_MM = 8.0
 """The slice of fig. 11 runs along the part's axis through the threaded hole."""
 LARGEST_SLICE = 320
 SEARCH_MM, SEARCH_VOXELS = 0.2, 2.0
+PROBE_SPACING_MM, PROBING_SIGMA_MM, PROBING_SEED = 1.0, 0.0005, 21
+"""Of the coordinate measuring machine: the paper's two machines agree to 0.3 um in the lengths that it keeps."""
+
+
+@functools.lru_cache(maxsize=2)
+def as_made(edge: float) -> Mesh:
+    """The specimen as made, part coordinates: what nobody knows."""
+    mesh = specimen(edge)
+    return Mesh(points=mesh.vertices, faces=mesh.faces)
 
 
 @functools.lru_cache(maxsize=2)
 def reference(edge: float) -> Mesh:
-    """The specimen as made, part coordinates, as a coordinate measuring machine would know it."""
-    mesh = specimen(edge)
-    return Mesh(points=mesh.vertices, faces=mesh.faces)
+    """The nominal mesh shifted to what a coordinate measuring machine probed of the specimen, part coordinates [21].
+
+    Edges cannot be probed and stay nominal.
+    """
+    nominal, made = specimen_mesh(edge=edge), as_made(edge)
+    mesh = Mesh(points=nominal.vertices, faces=nominal.faces)
+    rng = np.random.default_rng(PROBING_SEED)
+    smooth = np.flatnonzero(~made.on_edge)
+    step = max(int(PROBE_SPACING_MM / edge), 1) ** 2
+    chosen = rng.choice(smooth, len(smooth) // step, replace=False)
+    noise = PROBING_SIGMA_MM * rng.standard_normal(len(chosen))
+    return corrected_reference(
+        mesh, made.points[chosen] + noise[:, None] * made.normals[chosen], interpolation="natural"
+    )
+
+
+def reference_error_um(edge: float) -> float:
+    """um, rms over the smooth vertices: the reference less the specimen as made, along the normals."""
+    mesh, made = reference(edge), as_made(edge)
+    off = np.einsum("ij,ij->i", mesh.points - made.points, made.normals)[~made.on_edge]
+    return float(MICROMETRES_PER_MM * np.sqrt(np.mean(off**2)))
 
 
 def cylinder_areas(mesh: Mesh) -> np.ndarray:
@@ -134,7 +163,7 @@ def plan_for(alignment: Alignment, search_mm: float | None = None, sigma_mm: flo
 @functools.lru_cache(maxsize=2)
 def true_lengths(edge: float) -> Mapping[str, float]:
     """L1 to L7 of the specimen as made, mm: features fitted to its vertices, each weighted by the area around it."""
-    mesh, plan = reference(edge), plan_for(Alignment.none())
+    mesh, plan = as_made(edge), plan_for(Alignment.none())
     area = np.bincount(mesh.faces.ravel(), np.repeat(np.linalg.norm(mesh.face_normals, axis=1), 3), len(mesh.points))
     fits: dict[str, Feature] = {}
     for name, p in plan.features.items():

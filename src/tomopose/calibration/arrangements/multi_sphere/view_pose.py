@@ -117,28 +117,28 @@ def moved(T: RigidTransform, step: Array) -> RigidTransform:
 
 
 def _gauss_newton(
-    scanner: Scanner, x_D: Array, balls: Array, W: Array, T: RigidTransform, steps: int
+    scanner: Scanner, x_D: Array, balls: Array, W: Array, start: RigidTransform, steps: int
 ) -> tuple[RigidTransform, float, Array, Array, bool]:
     """Levenberg-Marquardt: (T, chi2, weighted J, residuals px, whether it came to rest)."""
-    x, J, *_ = view_rows(scanner, T, balls)
-    r = x_D - x
+    P = scanner.P_S @ scanner.T_WS.matrix
+    R, t = start.R, start.t
+    r, A = _weighted(P, R, t, x_D, balls, W)
     z = (W @ r[:, :, None]).ravel()
     chi2 = float(z @ z) if np.isfinite(z).all() else np.inf
-    A = (W @ J).reshape(-1, 6)
     damping, still = 1e-4, False
     for _ in range(steps):
         if not np.isfinite(chi2):
             break
         N = A.T @ A
         N[np.diag_indices(6)] *= 1 + damping
-        step = np.asarray(np.linalg.solve(N, A.T @ z), dtype=np.float64)
-        trial = moved(T, step)
-        x, J, *_ = view_rows(scanner, trial, balls)
-        z_new = (W @ (x_D - x)[:, :, None]).ravel()
+        step = np.linalg.solve(N, A.T @ z)
+        R_new, t_new = exp_rotation(step[:3]) @ R, t + step[3:]
+        r_new, A_new = _weighted(P, R_new, t_new, x_D, balls, W)
+        z_new = (W @ r_new[:, :, None]).ravel()
         chi2_new = float(z_new @ z_new) if np.isfinite(z_new).all() else np.inf
         if chi2_new <= chi2 * (1 + 1e-12) + 1e-18:
             still = bool(np.abs(A @ step).max() < TOLERANCE * max(1.0, np.sqrt(chi2)) or chi2 - chi2_new < 1e-9)
-            T, z, chi2, r, A, damping = trial, z_new, chi2_new, x_D - x, (W @ J).reshape(-1, 6), damping / 10
+            R, t, z, chi2, r, A, damping = R_new, t_new, z_new, chi2_new, r_new, A_new, damping / 10
             if still:
                 break
         else:
@@ -146,7 +146,20 @@ def _gauss_newton(
             if damping > 1e10:
                 still = True
                 break
-    return T, chi2, A, r, still
+    return RigidTransform(R=R, t=t, source=start.source, target=start.target), chi2, A, r, still
+
+
+def _weighted(P: Array, R: Array, t: Array, x_D: Array, balls: Array, W: Array) -> tuple[Array, Array]:
+    """Residuals (m, 2) px under P (3, 4) of points of W, and their derivatives W J (2m, 6) by (w, t) of the pose; nan
+    for balls behind the source."""
+    turned = balls @ R.T
+    h = (turned + t) @ P[:, :3].T + P[:, 3]
+    w = np.where(h[:, 2:] > 0, h[:, 2:], np.nan)
+    x = h[:, :2] / w
+    G = (P[None, :2, :3] - x[:, :, None] * P[None, 2:, :3]) / w[:, :, None]
+    # dx = G (w x R b + t): row i of -G [R b]_x is G_i cross R b with its sign turned
+    J = np.concatenate([np.cross(turned[:, None], G), G], axis=2)
+    return x_D - x, (W @ J).reshape(-1, 6)
 
 
 def refined_pose(scanner: Scanner, x_D: Array, balls: Array, start: RigidTransform) -> RigidTransform | None:
