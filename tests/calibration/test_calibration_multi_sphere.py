@@ -154,7 +154,8 @@ def test_a_wrong_centre_is_set_aside_and_said(scanner, path):
     spoilt = [*circles[:5], replace(c, x_D=x), *circles[6:]]
     found = tp.calibrate_multi_sphere(scanner, poses, spoilt, standard())
     (words,) = [w for w in found.left_out[poses.pose_id[5]] if "standard uncertainties" in w]
-    assert "0.3" in words
+    off = float(words.split(" px")[0].split()[-1])  # the pose gives way to it by a third
+    assert 0.2 < off < 0.4
     assert found.verdict == "trustworthy"
 
 

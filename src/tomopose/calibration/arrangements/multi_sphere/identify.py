@@ -32,7 +32,7 @@ NEAR, CLOSE_PX = 1.0, 2.0
 """A circle within so many of its radii of a projected ball may be that ball; within CLOSE_PX it is."""
 TRIPLES = 12
 """Triples of circles that are tried: one bad circle of six spoils half of them."""
-MOST_SHARE, LEAST_SHARE = 0.8, 0.6
+MOST_SHARE, LEAST_SHARE = 0.7, 0.6
 """Share of the circles that must be balls: to end the search, and to accept its best."""
 CLEAR_PX = 6.0
 """Least distance between the rims of two balls that both count, as in detection."""
