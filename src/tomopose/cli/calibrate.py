@@ -24,11 +24,13 @@ EPILOG = (
     "poses.csv --observations observations.csv --out cal/\n\n"
     "Twin robots: tomopose calibrate --twin twin.json --poses detector.csv --source-poses source.csv --scanner "
     "scanner.json --observations observations.csv --out cal/\n\n"
+    "A table that turns alone: tomopose calibrate --arrangement turntable --scanner scanner.json --poses poses.csv "
+    "--observations observations.csv --out cal/\n\n"
     "Multi-sphere: tomopose calibrate --method multi-sphere --standard standard.csv --scanner scanner.json --poses "
     "scan.csv --images standard_radiographs/ --out path/"
 )
-METHODS = ("single-sphere", "multi-sphere")
-ARRANGEMENTS = ("moving-object", "moving-scanner")
+ARRANGEMENTS = ("moving-object", "moving-scanner", "turntable")
+METHODS = ("poses", "turntable", "multi-sphere")
 
 SCALE_BAR = re.compile(r"(?P<a>\d+),(?P<b>\d+)=(?P<mm>\d+\.?\d*)\((?P<u>\d*\.?\d+)\)")
 
@@ -56,6 +58,8 @@ def require_arrangement(o: CalibrationOptions) -> None:
         )
     if o.method not in METHODS:
         raise typer.BadParameter(f"{o.method!r} is unknown; choose one of {', '.join(METHODS)}", param_hint="--method")
+    if o.method == "multi-sphere":
+        raise typer.BadParameter("is a way to calibrate; no conventions enter it", param_hint="--method")
     if o.turntable and (o.twin is not None or o.manipulator is not None or o.moving_scanner):
         raise typer.BadParameter(
             "a table that turns alone has no manipulator; leave out --manipulator, --twin and --arrangement",
@@ -187,8 +191,6 @@ def calibrate(options: Options) -> int:
     from tomopose.provenance import provenance
 
     o = options
-    if o.method not in METHODS:
-        raise typer.BadParameter(f"{o.method!r} is unknown; choose one of {', '.join(METHODS)}", param_hint="--method")
     if o.method == "multi-sphere":
         return calibrate_multi_sphere(o)
     if o.standard is not None:

@@ -17,6 +17,7 @@ FILES = ("multi-sphere.json", "observations.csv", "matrices.npz", "report.html")
 NOT_FOR_IT = {
     "observations": "--observations", "ball_diameter": "--ball-diameter-mm", "manipulator": "--manipulator",
     "distance": "--distance", "twin": "--twin", "source_poses": "--source-poses",
+    "from_pose": "--from-pose", "until_pose": "--until-pose",
 }  # fmt: skip
 
 
@@ -24,7 +25,7 @@ def require_options(o: Options) -> None:
     """A usage error for options of the other method, and where the standard or the images are missing."""
     for field, option in NOT_FOR_IT.items():
         if getattr(o, field):
-            raise typer.BadParameter("belongs to --method single-sphere", param_hint=option)
+            raise typer.BadParameter("has no meaning with --method multi-sphere", param_hint=option)
     if o.arrangement != "moving-object" or o.model not in ("auto", "rigid") or o.free != "auto":
         raise typer.BadParameter(
             "takes the pose of every view from the standard; leave out --arrangement, --model and --free",

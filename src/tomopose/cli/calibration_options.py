@@ -62,9 +62,23 @@ class CalibrationOptions(ObservedOptions, SpokenOptions):
         typer.Option(
             "--arrangement",
             help="What the manipulator carries: moving-object, or moving-scanner (source "
-            "and detector; C-arm, gantry), where the ball stands still.",
+            "and detector; C-arm, gantry), where the ball does not move; turntable: nothing moves but the table.",
         ),
     ] = "moving-object"
+    method: Annotated[
+        str,
+        typer.Option(
+            "--method",
+            help="poses; turntable: the same as --arrangement turntable; or multi-sphere: the path is run with a "
+            "calibrated standard of several balls, and every view's pose is found from it.",
+        ),
+    ] = "poses"
+    from_pose: Annotated[
+        str | None, typer.Option("--from-pose", help="Use the poses of the table from this pose_id on.")
+    ] = None
+    until_pose: Annotated[
+        str | None, typer.Option("--until-pose", help="Use the poses before this pose_id, which is left out.")
+    ] = None
     distance_sigma: Annotated[
         float,
         typer.Option(
@@ -86,20 +100,23 @@ class CalibrationOptions(ObservedOptions, SpokenOptions):
     def moving_scanner(self) -> bool:
         return self.arrangement == "moving-scanner"
 
+    @property
+    def turntable(self) -> bool:
+        return "turntable" in (self.arrangement, self.method)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Options(CalibrationOptions, WritingOptions):
     """The options of `tomopose calibrate`."""
 
-    out: Annotated[Path, typer.Option("--out", help="Folder for calibration.json, observations.csv, report.html.")]
-    method: Annotated[
-        str,
+    out: Annotated[
+        Path,
         typer.Option(
-            "--method",
-            help="single-sphere, or multi-sphere: the path is run with a calibrated standard of several balls, and "
-            "every view's pose is found from it; the folder then holds multi-sphere.json and matrices.npz.",
+            "--out",
+            help="Folder for calibration.json (multi-sphere: multi-sphere.json and matrices.npz), observations.csv, "
+            "report.html.",
         ),
-    ] = "single-sphere"
+    ]
     standard: Annotated[
         Path | None,
         typer.Option(
