@@ -53,3 +53,48 @@ def test_nothing_fits_is_an_answer_with_exit_code_3(files, capsys):
     assert shown["nothing_fits"]
     assert shown["leading"] == []
     assert shown["answer"] == "nothing fits"
+
+
+def test_a_turning_table_alone_has_its_own_method(tmp_path, capsys):
+    """Refused with a pointer without it; calibrated, diagnosed and made into matrices with it."""
+    rng = np.random.default_rng(2)
+    alpha = np.tile(np.linspace(0, 2 * np.pi, 24, endpoint=False), 3)
+    ball = np.repeat(np.arange(3), 24)
+    zero = np.zeros((72, 3))
+    scanner = tp.Scanner(d_SD=1200.0, d_SR=310.0, p_u=0.2, p_v=0.25, u_0=733.4, v_0=512.7, n_u=1501, n_v=1203)
+    poses = tp.PoseSequence.from_table(zero, zero, alpha=alpha, ball_id=ball)
+    x = np.array([[14.0, -3.0, -20.0], [-5.0, 11.0, 2.0], [3.0, -13.0, 18.0]])
+    real = replace(scanner, u_0=739.0, eta=4e-3)
+    mount = tp.RigidTransform.identity(tp.Frame.H, tp.Frame.T)
+    seen = tp.project_ball(real, T_HT=mount, T_MH=poses.T_MH, t=x[ball], alpha=alpha)
+    observed = tp.BallObservations.from_sigma(seen + rng.normal(0, 0.015, seen.shape), 0.015, pose_id=poses.pose_id)
+    tp.write_scanner(tmp_path / "scanner.json", scanner)
+    tp.write_poses(tmp_path / "poses.csv", poses)
+    tp.write_observations(tmp_path / "observations.csv", observed)
+    given = ["--scanner", tmp_path / "scanner.json", "--poses", tmp_path / "poses.csv"]
+    given = [str(w) for w in [*given, "--observations", tmp_path / "observations.csv"]]
+    assert run(["calibrate", *given, "--out", str(tmp_path / "no")]) == 1
+    assert "--arrangement turntable" in capsys.readouterr().err
+    for k, option in enumerate((["--arrangement", "turntable"], ["--method", "turntable"])):
+        assert run(["calibrate", *given, *option, "--out", str(tmp_path / f"cal{k}"), "--quiet"]) == 0
+        cal = tp.read_calibration(tmp_path / f"cal{k}" / "calibration.json")
+        found = {p.name: p for p in cal.parameters}
+        assert abs(found["u_0"].value - 739.0) < 5 * found["u_0"].u < 0.1
+        assert abs(found["eta"].value - 4e-3) < 5 * found["eta"].u < 1e-4
+    code, shown = said(["diagnose", *given, "--arrangement", "turntable"], capsys)
+    assert (code, shown["leading"]) == (0, [])
+    assert "circular scan" in (tmp_path / "cal0" / "calibration.json").read_text(encoding="utf-8")
+
+
+def test_the_part_of_a_run_before_or_from_a_pose_on_is_calibrated(files, capsys):
+    middle = files.poses.pose_id[len(files.poses) // 2]
+    n = len(tp.read_observations(files.folder / "observations.csv"))
+    used = []
+    for option in ("--until-pose", "--from-pose"):
+        words = files.calibrate(option.strip("-"))
+        assert run([*words, option, middle, "--quiet"]) in (0, 3)
+        cal = tp.read_calibration(files.folder / option.strip("-") / "calibration.json")
+        used += [*cal.pose_id, *cal.outliers]
+        assert (middle in cal.pose_id) == (option == "--from-pose")
+    assert len(used) == len(set(used)) <= n
+    assert run([*files.calibrate("never"), "--until-pose", "no such pose"]) == 2
