@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from calibration_cases import BALL, MOUNT, SCANNER, mixed_poses, observe, paper_poses
@@ -96,7 +98,9 @@ def test_pixels_and_lengths():
     share = np.mean(pixels, axis=0)
     assert LOW <= share.mean() <= HIGH
     assert share.min() > LOW - 0.01
-    u_length = length_sigma(cal, scan, x[:1], x[1:2])[0]
+    # the draws know nothing of what no ball shows, which lengths carry too
+    u_length = length_sigma(replace(cal, unseen=None), scan, x[:1], x[1:2])[0]
+    assert length_sigma(cal, scan, x[:1], x[1:2])[0] > u_length
     assert LOW <= np.mean(np.abs(lengths) < 1.96 * u_length) <= HIGH
     np.testing.assert_allclose(np.std(points, axis=0), object_sigma(cal, scan, x), rtol=0.1)
 

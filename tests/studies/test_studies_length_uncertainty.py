@@ -132,7 +132,10 @@ def test_a_distance_of_planes_has_the_share_of_the_points_between_them(run, cali
 def test_virtual_scans_with_drawn_calibrations_scatter_as_the_covariance_says(run, calibration):
     """No noise: only the calibration that is believed differs between the scans, here with d_SR uncertain too."""
     wide = replace(
-        calibration, tangent=(*calibration.tangent, "d_SR"), covariance=block_diag(calibration.covariance, 0.2**2)
+        calibration,
+        tangent=(*calibration.tangent, "d_SR"),
+        covariance=block_diag(calibration.covariance, 0.2**2),
+        unseen=None,  # the draws know nothing of it
     )
     grid = tp.VoxelGrid.cube(n=SIZE, spacing=VOXEL)
     draws = 10
@@ -161,6 +164,7 @@ def kinematic(run, calibration):
         errors=errors,
         tangent=(*calibration.tangent, *machine.names),
         covariance=block_diag(calibration.covariance, np.diag(machine.sigma**2)),
+        unseen=None,  # the draws know nothing of it
     )
 
 

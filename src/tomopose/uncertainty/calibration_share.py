@@ -1,8 +1,8 @@
 """What a calibration means for measured lengths: from its covariance through the matrices and the volume to the part.
 
 A wrong calibration moves each point of the reconstruction by a smooth field.  Along every principal direction of the
-covariance the points of all features are moved by that field, the features fitted and the measurands evaluated again;
-the changes add up in squares.
+covariance, of what was estimated and of what no ball shows, the points of all features are moved by that field, the
+features fitted and the measurands evaluated again; the changes add up in squares.
 """
 
 from __future__ import annotations
@@ -13,11 +13,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from tomopose.calibration.result import Calibration
-from tomopose.calibration.uncertainty.propagation import apparent_displacement
-from tomopose.calibration.uncertainty.trajectory import pixels, point_jacobian, trajectory_jacobian
+from tomopose.calibration.uncertainty.propagation import scan_displacement
 from tomopose.errors import InputError
-from tomopose.geometry.projection import eq5_matrices
-from tomopose.manipulator.error_models import RigidErrors, correction
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.measurement.bench import refitted
 from tomopose.measurement.features.feature import Feature
@@ -31,24 +28,6 @@ NODES = 3
 """Places a side at which the field is worked out; between them it is quadratic."""
 POINTS = 300
 """Points of a feature that are moved."""
-
-
-def displacement_field(calibration: Calibration, poses: PoseSequence, x_W: Array) -> Array:
-    """(m, 3, c) mm: where points x_W (m, 3) come to lie, by the coordinates of the calibration's covariance.
-
-    poses: the scan's, as commanded.  With identified errors of the manipulator the object's rigid pose is removed.
-    """
-    if isinstance(calibration.errors, RigidErrors):
-        return apparent_displacement(calibration, poses, x_W)
-    T_MH = correction(calibration.errors, poses).poses.T_MH
-    alpha = np.zeros(len(poses)) if poses.alpha is None else poses.alpha
-    P = eq5_matrices(calibration.scanner, T_HT=calibration.T_HT, T_MH=T_MH, alpha=alpha)
-    if not np.isfinite(pixels(P, x_W)).all():
-        raise InputError("points of the part have no image in some views; are these the scan's poses?")
-    J, _ = trajectory_jacobian(calibration, poses, x_W)
-    G = point_jacobian(P, x_W)
-    N = np.einsum("nmia,nmib->mab", G, G)
-    return -np.linalg.solve(N, np.einsum("nmia,nmic->mac", G, J, optimize=True))
 
 
 def calibration_shares(
@@ -67,8 +46,8 @@ def calibration_shares(
     side = np.linspace(-1.0, 1.0, NODES)
     nodes = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     half = np.maximum((high - low) / 2, 1e-6)
-    field = displacement_field(calibration, poses, (low + high) / 2 + nodes * half)
-    values, vectors = np.linalg.eigh(calibration.covariance)
+    field, C = scan_displacement(calibration, poses, (low + high) / 2 + nodes * half)
+    values, vectors = np.linalg.eigh(C)
     directions = vectors * np.sqrt(np.maximum(values, 0.0))
     scale, alignment = results.scale.get(volume, 1.0), results.alignments[volume]
 

@@ -23,7 +23,13 @@ from tomopose.calibration.checks.alternative import Alternative
 from tomopose.calibration.checks.conventions import ALTERNATIVES, ALTERNATIVES_OF_MOVING_SCANNER
 from tomopose.calibration.checks.placement import Placement, beams, better_placed, placement
 from tomopose.calibration.checks.stability import SIGNIFICANT, Effect, chi2_with_movements, movements
-from tomopose.calibration.model.parameters import UNITS, FreeParameters, adjusted_scanners, free_parameters
+from tomopose.calibration.model.parameters import (
+    UNITS,
+    FreeParameters,
+    ImpossibleScannerError,
+    adjusted_scanners,
+    free_parameters,
+)
 from tomopose.calibration.model.problem import Problem, pair
 from tomopose.calibration.model.silhouettes import chain_matrices, size_ratio_of
 from tomopose.calibration.rigid.estimate import best_fit
@@ -269,8 +275,11 @@ def _size_ratio(problem: Problem, free: FreeParameters, fit: Fit) -> float:
     """Measured size of the silhouettes over the calculated one; NaN where it is not known or cannot be calculated."""
     if problem.outline is None or problem.ball_diameter is None or not np.isfinite(fit.chi2):
         return float("nan")
-    P = chain_matrices(problem, adjusted_scanners(problem.scanners, free, fit.delta), fit.T_HT)
-    found = size_ratio_of(problem, P, fit.t[problem.ball])
+    try:
+        scanners = adjusted_scanners(problem.scanners, free, fit.delta)
+    except ImpossibleScannerError:  # a wrong reading may end anywhere
+        return float("nan")
+    found = size_ratio_of(problem, chain_matrices(problem, scanners, fit.T_HT), fit.t[problem.ball])
     return float("nan") if found is None else found
 
 

@@ -14,11 +14,14 @@ import numpy as np
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.model.parameters import base_name
 from tomopose.calibration.result import Calibration
+from tomopose.calibration.uncertainty.trajectory import pixels, plate_points, point_jacobian, scan_jacobian
+from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import eq5_matrices
 from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.error_models import correction
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.units import Array
 
@@ -106,11 +109,28 @@ def object_sigma(calibration: Calibration, poses: PoseSequence, x_W: Any) -> Arr
     return np.sqrt(np.einsum("mac,cd,mad->ma", B, calibration.covariance, B))
 
 
+def scan_displacement(calibration: Calibration, poses: PoseSequence, x_W: Any) -> tuple[Array, Array]:
+    """(B (m, 3, c) mm, C (c, c)): where points x_W (m, 3) come to lie, by everything that was estimated or assumed.
+
+    As `apparent_displacement`, for every model, with what no ball shows beside the calibration's coordinates; the rigid
+    pose of the object is taken out, so that lengths between the points are right and their places are not stated.
+    """
+    x = np.asarray(x_W, dtype=np.float64)
+    J, C = scan_jacobian(calibration, poses, plate_points(calibration, x))
+    T_MH = correction(calibration.errors, poses).poses.T_MH
+    P = eq5_matrices(calibration.scanner, T_HT=calibration.T_HT, T_MH=T_MH, alpha=_alpha(poses))
+    if not np.isfinite(pixels(P, x)).all():
+        raise InputError("points of the part have no image in some views; are these the scan's poses?")
+    G = point_jacobian(P, x)
+    N = np.einsum("nmia,nmib->mab", G, G)
+    return -np.linalg.solve(N, np.einsum("nmia,nmic->mac", G, J, optimize=True)), C
+
+
 def length_sigma(calibration: Calibration, poses: PoseSequence, x_a: Any, x_b: Any) -> Array:
-    """(m,) mm: standard uncertainty, from the calibration alone, of the lengths between points x_a and x_b (m, 3) of W
-    in a reconstruction of this scan."""
+    """(m,) mm: standard uncertainty, from the calibration and all that it assumed, of the lengths between points x_a
+    and x_b (m, 3) of W in a reconstruction of this scan."""
     a, b = np.atleast_2d(np.asarray(x_a, dtype=np.float64)), np.atleast_2d(np.asarray(x_b, dtype=np.float64))
     along = (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True)
-    B = apparent_displacement(calibration, poses, b) - apparent_displacement(calibration, poses, a)
-    g = np.einsum("ma,mac->mc", along, B)
-    return np.sqrt(np.einsum("mc,cd,md->m", g, calibration.covariance, g))
+    B, C = scan_displacement(calibration, poses, np.concatenate([a, b]))
+    g = np.einsum("ma,mac->mc", along, B[len(a) :] - B[: len(a)])
+    return np.sqrt(np.einsum("mc,cd,md->m", g, C, g))
