@@ -1,5 +1,6 @@
-"""Robot tables under the wrong convention: named, or nothing advised?  python benchmarks/trust/robot_mistakes.py [SEEDS]
+"""Robot tables under the wrong convention: named, or nothing advised?
 
+`python benchmarks/trust/robot_mistakes.py [SEEDS]`.
 Seven mistakes of people's robots, each with other poses, mount, ball and noise by a seed: the true reading must be the
 only one that is advised, and nothing is ever advised that leaves more than 10 stated standard uncertainties.  The
 centres come from benchmarks/reality/chain.py, which shares no code with the library.
