@@ -131,6 +131,30 @@ def test_places_that_cannot_be_written_are_named(tmp_path):
         require_absent("a\0b")
 
 
+def test_devices_pipes_and_sockets_are_refused_and_stay(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "pipe")
+    for name in ("pipe", "link"):
+        with pytest.raises(FileError, match="device, a pipe or a socket"):
+            require_absent(tmp_path / name, force=True)
+        with pytest.raises(FileError, match="device, a pipe or a socket"), atomic_file(tmp_path / name) as temporary:
+            temporary.write_text("x")
+    assert (tmp_path / "pipe").is_fifo()
+    assert (tmp_path / "link").is_symlink()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link", "pipe"]
+
+
+def test_a_link_to_a_file_stays_and_the_file_gets_the_new_content(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "file").write_text("old")
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere" / "file")
+    with atomic_file(tmp_path / "link") as temporary:
+        temporary.write_text("new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "elsewhere" / "file").read_text() == "new"
+    assert [p.name for p in (tmp_path / "elsewhere").iterdir()] == ["file"]
+
+
 def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path):
     def full():
         with atomic_file(tmp_path / "a.csv") as temporary:

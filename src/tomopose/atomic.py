@@ -39,20 +39,32 @@ def require_absent(path: str | Path, *, force: bool = False) -> Path:
         raise FileError(f"{str(path)[:200]} is no path that can be written: {error}", path=path) from error
     if there and path.is_symlink() and not path.exists():
         raise FileError(f"{path} is a link to nothing; remove it or give another name", path=path)
+    _require_file_or_folder(path)
     if there and not force:
         raise FileError(f"{path} exists already; give another name or --force to overwrite it", path=path)
     return path
+
+
+def _require_file_or_folder(path: Path) -> None:
+    """FileError for a device, pipe or socket: a file renamed to its name would take it away from every program."""
+    if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
+        raise FileError(f"{path} is a device, a pipe or a socket; give the name of a file", path=path)
 
 
 @contextlib.contextmanager
 def atomic_file(path: str | Path) -> Iterator[Path]:
     """A temporary path in the same folder (same suffix); on leaving without error it takes the place of `path`.
 
+    A link stays: what it leads to is replaced.
+
     Raises FileError where the folder cannot be made or written, or the disk is full.
     """
     path = Path(path)
     temporary: Path | None = None
     try:
+        _require_file_or_folder(path)
+        if path.is_symlink():
+            path = path.resolve()
         path.parent.mkdir(parents=True, exist_ok=True)
         _remove_leftovers_once(path.parent.absolute())
         handle, name = tempfile.mkstemp(prefix=_prefix(path), suffix=path.suffix, dir=path.parent)
