@@ -11,7 +11,7 @@ from tomopose.calibration.model.ball_projection import ProjectionBlocks, project
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, translation_scale
 from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.rigid.kernel import CONVERGED, centres, levenberg_marquardt
+from tomopose.calibration.rigid.kernel import CONVERGED, Freed, Point, Rows, centres, levenberg_marquardt
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
@@ -36,6 +36,28 @@ class Fit:
         return RigidTransform(R=self.R_HT, t=self.t_HT, source=Frame.H, target=Frame.T)
 
 
+def rows_of(problem: Problem, weight: Array | None = None) -> Rows:
+    """The rows of a problem as the kernel takes them; weight (n,) on the squared residuals, or all 1."""
+    w = np.ones(len(problem)) if weight is None else np.ascontiguousarray(weight, dtype=np.float64)
+    return Rows(
+        x=problem.x_D,
+        W=problem.W,
+        weight=w,
+        R=problem.R_MH,
+        t=problem.t_MH,
+        alpha=problem.alpha,
+        run=problem.run,
+        ball=problem.ball,
+    )
+
+
+def freed_of(problem: Problem, free: FreeParameters) -> Freed:
+    """The freed parameters as the kernel takes them."""
+    return Freed(
+        s_0=problem.s_0, cols=free.cols, col_run=free.col_run, factor=free.factor, information=free.information
+    )
+
+
 def minimise(
     problem: Problem,
     free: FreeParameters,
@@ -51,49 +73,16 @@ def minimise(
     R, t_HT, t = (np.array(v, dtype=np.float64, order="C") for v in (R, t_HT, t))
     m = 6 + 3 * len(t) + len(free)
     N = np.zeros((m, m))
-    w = np.ones(len(problem)) if weight is None else np.ascontiguousarray(weight, dtype=np.float64)
-    chi2, status = levenberg_marquardt(
-        problem.x_D,
-        problem.W,
-        w,
-        problem.R_MH,
-        problem.t_MH,
-        problem.alpha,
-        problem.run,
-        problem.ball,
-        problem.s_0,
-        free.cols,
-        free.col_run,
-        free.factor,
-        free.information,
-        R,
-        t_HT,
-        t,
-        delta,
-        iterations,
-        N,
-    )
+    at = Point(R, t_HT, t, delta)
+    chi2, status = levenberg_marquardt(rows_of(problem, weight), freed_of(problem, free), at, iterations, N)
     U, _, V = np.linalg.svd(R)
     return Fit(R_HT=U @ V, t_HT=t_HT, t=t, delta=delta, chi2=float(chi2), converged=status == CONVERGED, N=N)
 
 
 def residuals(problem: Problem, free: FreeParameters, fit: Fit) -> Array:
     """(n, 2) px: observed minus calculated centres; NaN where a ball would be behind the source."""
-    return problem.x_D - centres(
-        problem.R_MH,
-        problem.t_MH,
-        problem.alpha,
-        problem.run,
-        problem.ball,
-        problem.s_0,
-        free.cols,
-        free.col_run,
-        free.factor,
-        np.ascontiguousarray(fit.R_HT),
-        fit.t_HT,
-        fit.t,
-        fit.delta,
-    )
+    at = Point(np.ascontiguousarray(fit.R_HT), fit.t_HT, fit.t, fit.delta)
+    return problem.x_D - centres(rows_of(problem), freed_of(problem, free), at)
 
 
 def whitened2(problem: Problem, r: Array) -> Array:

@@ -8,7 +8,7 @@ scanner parameters from their nominal values.  A freed parameter j changes colum
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -19,6 +19,40 @@ from tomopose.units import Array
 CONVERGED, STALLED, OUT_OF_ITERATIONS, SINGULAR = 0, 1, 2, 3
 STEP_TOLERANCE = 1e-10
 """The iteration ends when a step is shorter than this, measured in standard deviations of the estimate."""
+
+
+class Rows(NamedTuple):
+    """n observed centres x (n, 2) px with whiteners W (n, 2, 2) and weights (n,) on their squares, the poses R
+    (n, 3, 3), t (n, 3), alpha (n,) of the rows, and the index of each row's run and ball, (n,)."""
+
+    x: Array
+    W: Array
+    weight: Array
+    R: Array
+    t: Array
+    alpha: Array
+    run: Any
+    ball: Any
+
+
+class Freed(NamedTuple):
+    """Scanner vectors s_0 (runs, 13) at nominal values, and where the f freed parameters act: cols, col_run, factor
+    (f,); information (f,) is 1/sigma^2 of their priors."""
+
+    s_0: Array
+    cols: Any
+    col_run: Any
+    factor: Array
+    information: Array
+
+
+class Point(NamedTuple):
+    """The unknowns: R_HT (3, 3), t_HT (3,), balls t (balls, 3), deviations delta (f,) of the freed parameters."""
+
+    R_HT: Array
+    t_HT: Array
+    t: Array
+    delta: Array
 
 
 @njit(cache=True)
@@ -69,75 +103,42 @@ def _solve_spd(N: Array, lam: float, g: Array, L: Array, step: Array) -> bool:
 
 
 @njit(cache=True)
-def _scanner_vectors(s_0: Array, cols: Any, col_run: Any, factor: Array, delta: Array, s: Array) -> None:
-    s[:] = s_0
-    for j in range(cols.shape[0]):
-        if col_run[j] < 0:
+def _scanner_vectors(freed: Freed, delta: Array, s: Array) -> None:
+    s[:] = freed.s_0
+    for j in range(freed.cols.shape[0]):
+        if freed.col_run[j] < 0:
             for r in range(s.shape[0]):
-                s[r, cols[j]] += factor[j] * delta[j]
+                s[r, freed.cols[j]] += freed.factor[j] * delta[j]
         else:
-            s[col_run[j], cols[j]] += factor[j] * delta[j]
+            s[freed.col_run[j], freed.cols[j]] += freed.factor[j] * delta[j]
 
 
 @njit(cache=True)
-def centres(
-    R_k: Array,
-    t_k: Array,
-    alpha: Array,
-    run: Any,
-    ball: Any,
-    s_0: Array,
-    cols: Any,
-    col_run: Any,
-    factor: Array,
-    R_HT: Array,
-    t_HT: Array,
-    t: Array,
-    delta: Array,
-) -> Array:
+def centres(rows: Rows, freed: Freed, at: Point) -> Array:
     """(n, 2) px: the calculated centres, without derivatives; NaN where a ball is behind the source."""
-    n = R_k.shape[0]
+    n = rows.R.shape[0]
     out = np.full((n, 2), np.nan)
     x_H, y_T, G_H, G_T = np.empty(3), np.empty(3), np.empty((2, 3)), np.empty((2, 3))
     J_s, R, M = np.empty((2, 13)), np.empty((3, 3)), np.empty((3, 3))
-    s = s_0.copy()
-    _scanner_vectors(s_0, cols, col_run, factor, delta, s)
+    s = freed.s_0.copy()
+    _scanner_vectors(freed, at.delta, s)
     for k in range(n):
         project_pose(
-            s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[ball[k]], alpha[k], False, out[k], x_H, G_H, G_T, y_T, J_s, R, M
-        )
+            s[rows.run[k]], at.R_HT, at.t_HT, rows.R[k], rows.t[k], at.t[rows.ball[k]], rows.alpha[k], False, out[k],
+            x_H, G_H, G_T, y_T, J_s, R, M,
+        )  # fmt: skip
     return out
 
 
 @njit(cache=True)
-def normal_equations(
-    x_meas: Array,
-    W: Array,
-    weight: Array,
-    R_k: Array,
-    t_k: Array,
-    alpha: Array,
-    run: Any,
-    ball: Any,
-    s: Array,
-    cols: Any,
-    col_run: Any,
-    factor: Array,
-    information: Array,
-    R_HT: Array,
-    t_HT: Array,
-    t: Array,
-    delta: Array,
-    derivatives: bool,
-    N: Array,
-    g: Array,
-) -> float:
+def normal_equations(rows: Rows, s: Array, freed: Freed, at: Point, derivatives: bool, N: Array, g: Array) -> float:
     """chi2 at a point; with `derivatives` also N = J^T J and g = J^T r (r = observed - calculated, whitened).
 
-    W (n, 2, 2) whitens a residual, weight (n,) multiplies its square, information (f,) is 1/sigma^2 of the priors.
-    Infinite where a ball is behind the source.
+    s (runs, 13): scanner vectors at the point.  Infinite where a ball is behind the source.
     """
-    n, n_b, n_f = x_meas.shape[0], t.shape[0], cols.shape[0]
+    W, weight, R_k, run, ball = rows.W, rows.weight, rows.R, rows.run, rows.ball
+    cols, col_run, factor, information, delta = freed.cols, freed.col_run, freed.factor, freed.information, at.delta
+    n, n_b, n_f = rows.x.shape[0], at.t.shape[0], cols.shape[0]
     x, x_H, y_T = np.empty(2), np.empty(3), np.empty(3)
     G_H, G_T, J_s = np.empty((2, 3)), np.empty((2, 3)), np.zeros((2, 13))
     R, M = np.empty((3, 3)), np.empty((3, 3))
@@ -155,10 +156,11 @@ def normal_equations(
         if weight[k] == 0.0:
             continue
         if not project_pose(
-            s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[ball[k]], alpha[k], derivatives, x, x_H, G_H, G_T, y_T, J_s, R, M
-        ):
+            s[run[k]], at.R_HT, at.t_HT, R_k[k], rows.t[k], at.t[ball[k]], rows.alpha[k], derivatives, x,
+            x_H, G_H, G_T, y_T, J_s, R, M,
+        ):  # fmt: skip
             return np.inf
-        du, dv = x_meas[k, 0] - x[0], x_meas[k, 1] - x[1]
+        du, dv = rows.x[k, 0] - x[0], rows.x[k, 1] - x[1]
         r0 = W[k, 0, 0] * du + W[k, 0, 1] * dv
         r1 = W[k, 1, 0] * du + W[k, 1, 1] * dv
         chi2 += weight[k] * (r0 * r0 + r1 * r1)
@@ -198,60 +200,31 @@ def normal_equations(
 
 
 @njit(cache=True)
-def levenberg_marquardt(
-    x_meas: Array,
-    W: Array,
-    weight: Array,
-    R_k: Array,
-    t_k: Array,
-    alpha: Array,
-    run: Any,
-    ball: Any,
-    s_0: Array,
-    cols: Any,
-    col_run: Any,
-    factor: Array,
-    information: Array,
-    R_HT: Array,
-    t_HT: Array,
-    t: Array,
-    delta: Array,
-    iterations: int,
-    N: Array,
-) -> tuple[float, int]:
-    """Minimise chi2 from (R_HT, t_HT, t, delta), which are overwritten by the optimum; N becomes J^T J there.
+def _moved(at: Point, step: Array, to: Point) -> None:
+    """The point after a step, written into `to`."""
+    n_b = at.t.shape[0]
+    _exp_times(step[:3], at.R_HT, to.R_HT)
+    for i in range(3):
+        to.t_HT[i] = at.t_HT[i] + step[3 + i]
+        for j in range(n_b):
+            to.t[j, i] = at.t[j, i] + step[6 + 3 * j + i]
+    for j in range(at.delta.shape[0]):
+        to.delta[j] = at.delta[j] + step[6 + 3 * n_b + j]
+
+
+@njit(cache=True)
+def levenberg_marquardt(rows: Rows, freed: Freed, at: Point, iterations: int, N: Array) -> tuple[float, int]:
+    """Minimise chi2 from the point `at`, which is overwritten by the optimum; N becomes J^T J there.
 
     Returns (chi2, status).
     """
-    n_b, n_f = t.shape[0], cols.shape[0]
-    m = 6 + 3 * n_b + n_f
+    m = N.shape[0]
     g, step, L = np.zeros(m), np.zeros(m), np.zeros((m, m))
     g_new, N_new = np.zeros(m), np.zeros((m, m))
-    s = s_0.copy()
-    R_new, t_HT_new, t_new, delta_new = R_HT.copy(), t_HT.copy(), t.copy(), delta.copy()
-    _scanner_vectors(s_0, cols, col_run, factor, delta, s)
-    chi2 = normal_equations(
-        x_meas,
-        W,
-        weight,
-        R_k,
-        t_k,
-        alpha,
-        run,
-        ball,
-        s,
-        cols,
-        col_run,
-        factor,
-        information,
-        R_HT,
-        t_HT,
-        t,
-        delta,
-        True,
-        N,
-        g,
-    )
+    s = freed.s_0.copy()
+    trial = Point(at.R_HT.copy(), at.t_HT.copy(), at.t.copy(), at.delta.copy())
+    _scanner_vectors(freed, at.delta, s)
+    chi2 = normal_equations(rows, s, freed, at, True, N, g)
     if not chi2 < np.inf:
         return np.inf, SINGULAR
     lam, grow = 1e-4, 2.0
@@ -265,40 +238,13 @@ def levenberg_marquardt(
         for i in range(m):
             length += step[i] * g[i]  # for lam -> 0 this is step^T N step
             gain += step[i] * (g[i] + lam * N[i, i] * step[i])
-        _exp_times(step[:3], R_HT, R_new)
-        for i in range(3):
-            t_HT_new[i] = t_HT[i] + step[3 + i]
-            for j in range(n_b):
-                t_new[j, i] = t[j, i] + step[6 + 3 * j + i]
-        for j in range(n_f):
-            delta_new[j] = delta[j] + step[6 + 3 * n_b + j]
-        _scanner_vectors(s_0, cols, col_run, factor, delta_new, s)
-        chi2_new = normal_equations(
-            x_meas,
-            W,
-            weight,
-            R_k,
-            t_k,
-            alpha,
-            run,
-            ball,
-            s,
-            cols,
-            col_run,
-            factor,
-            information,
-            R_new,
-            t_HT_new,
-            t_new,
-            delta_new,
-            True,
-            N_new,
-            g_new,
-        )
+        _moved(at, step, trial)
+        _scanner_vectors(freed, trial.delta, s)
+        chi2_new = normal_equations(rows, s, freed, trial, True, N_new, g_new)
         small = length < STEP_TOLERANCE * STEP_TOLERANCE
         if chi2_new < chi2 or (small and chi2_new < np.inf) or chi2_new == chi2:
             ratio = (chi2 - chi2_new) / gain if gain > 0 else 1.0
-            R_HT[:], t_HT[:], t[:], delta[:] = R_new, t_HT_new, t_new, delta_new
+            at.R_HT[:], at.t_HT[:], at.t[:], at.delta[:] = trial.R_HT, trial.t_HT, trial.t, trial.delta
             chi2 = chi2_new
             N[:], g[:] = N_new, g_new
             if small and lam < 1e-3:
@@ -330,115 +276,39 @@ def _log_rotation(D: Array, out: Array) -> None:
 
 @njit(cache=True)
 def _solve_one(
-    x: Array,
-    W: Array,
-    weight: Array,
-    R_k: Array,
-    t_k: Array,
-    alpha: Array,
-    run: Any,
-    ball: Any,
-    s_0: Array,
-    cols: Any,
-    col_run: Any,
-    factor: Array,
-    information: Array,
-    centre: Array,
-    R_HT: Array,
-    t_HT: Array,
-    t: Array,
-    delta: Array,
-    iterations: int,
-    theta: Array,
+    rows: Rows, freed: Freed, centre: Array, start: Point, iterations: int, theta: Array
 ) -> tuple[float, int]:
-    """One solve from a start, its result written into theta (m,)."""
-    n_b, n_f = t.shape[0], cols.shape[0]
-    m = theta.shape[0]
-    R_b, t_HT_b, t_b, delta_b = R_HT.copy(), t_HT.copy(), t.copy(), delta - centre
-    s_b, N = s_0.copy(), np.zeros((m, m))
-    _scanner_vectors(s_0, cols, col_run, factor, centre, s_b)
-    chi2, status = levenberg_marquardt(
-        x,
-        W,
-        weight,
-        R_k,
-        t_k,
-        alpha,
-        run,
-        ball,
-        s_b,
-        cols,
-        col_run,
-        factor,
-        information,
-        R_b,
-        t_HT_b,
-        t_b,
-        delta_b,
-        iterations,
-        N,
-    )
-    _log_rotation(R_b @ R_HT.T, theta)
-    theta[3:6] = t_HT_b
+    """One solve from a start with the priors centred at `centre` (f,), its result written into theta (m,)."""
+    n_b, n_f, m = start.t.shape[0], centre.shape[0], theta.shape[0]
+    at = Point(start.R_HT.copy(), start.t_HT.copy(), start.t.copy(), start.delta - centre)
+    s, N = freed.s_0.copy(), np.zeros((m, m))
+    _scanner_vectors(freed, centre, s)
+    shifted = Freed(s, freed.cols, freed.col_run, freed.factor, freed.information)
+    chi2, status = levenberg_marquardt(rows, shifted, at, iterations, N)
+    _log_rotation(at.R_HT @ start.R_HT.T, theta)
+    theta[3:6] = at.t_HT
     for j in range(n_b):
-        theta[6 + 3 * j : 9 + 3 * j] = t_b[j]
+        theta[6 + 3 * j : 9 + 3 * j] = at.t[j]
     for j in range(n_f):
-        theta[6 + 3 * n_b + j] = centre[j] + delta_b[j]
+        theta[6 + 3 * n_b + j] = centre[j] + at.delta[j]
     return chi2, status
 
 
 @njit(cache=True, parallel=True)
 def solve_batch(
-    x_all: Array,
-    W: Array,
-    weight: Array,
-    R_all: Array,
-    t_all: Array,
-    alpha: Array,
-    run: Any,
-    ball: Any,
-    s_0: Array,
-    cols: Any,
-    col_run: Any,
-    factor: Array,
-    information: Array,
-    prior: Array,
-    R_HT: Array,
-    t_HT: Array,
-    t: Array,
-    delta: Array,
-    iterations: int,
+    x_all: Array, R_all: Array, t_all: Array, rows: Rows, freed: Freed, prior: Array, start: Point, iterations: int
 ) -> Any:
-    """Many solves of one plan, from one start: x_all (b, n, 2); R_all (b or 1, n, 3, 3), t_all (b or 1, n, 3).
+    """Many solves of one plan, from one start: x_all (b, n, 2); R_all (b or 1, n, 3, 3), t_all (b or 1, n, 3) replace
+    those of `rows`.
 
     prior (b or 1, f): centre of the prior of delta in each solve (a Monte Carlo draws it too).
     Returns theta (b, m): w (by which R = exp(w) R_HT of the start), t_HT, t ..., delta; chi2 (b,); status (b,).
     """
     n_s = x_all.shape[0]
-    m = 6 + 3 * t.shape[0] + cols.shape[0]
+    m = 6 + 3 * start.t.shape[0] + freed.cols.shape[0]
     theta, chi2, status = np.empty((n_s, m)), np.empty(n_s), np.empty(n_s, dtype=np.int64)
     for b in prange(n_s):
         i, j = b % prior.shape[0], b % R_all.shape[0]
-        chi2[b], status[b] = _solve_one(
-            x_all[b],
-            W,
-            weight,
-            R_all[j],
-            t_all[j],
-            alpha,
-            run,
-            ball,
-            s_0,
-            cols,
-            col_run,
-            factor,
-            information,
-            prior[i],
-            R_HT,
-            t_HT,
-            t,
-            delta,
-            iterations,
-            theta[b],
-        )
+        own = Rows(x_all[b], rows.W, rows.weight, R_all[j], t_all[j], rows.alpha, rows.run, rows.ball)
+        chi2[b], status[b] = _solve_one(own, freed, prior[i], start, iterations, theta[b])
     return theta, chi2, status

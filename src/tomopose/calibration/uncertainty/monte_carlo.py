@@ -14,8 +14,8 @@ import numpy as np
 from tomopose.calibration.model.parameters import FreeParameters, base_name, free_parameters
 from tomopose.calibration.model.problem import Problem, pair
 from tomopose.calibration.result import Calibration
-from tomopose.calibration.rigid.fit import Fit, blocks, tangent_names
-from tomopose.calibration.rigid.kernel import CONVERGED, solve_batch
+from tomopose.calibration.rigid.fit import Fit, blocks, freed_of, rows_of, tangent_names
+from tomopose.calibration.rigid.kernel import CONVERGED, Point, solve_batch
 from tomopose.calibration.rigid.pose_noise import PoseNoise, total_covariance
 from tomopose.errors import InputError
 from tomopose.geometry.rotations import exp_rotation
@@ -75,7 +75,7 @@ def draw(
     sigma = np.where(np.isfinite(free.sigma), free.sigma, 0.0)
     n, f = len(problem), len(free)
     rng = np.random.default_rng(np.random.SeedSequence(seed))
-    ones = np.ones(n)
+    start = Point(np.ascontiguousarray(truth.R_HT), truth.t_HT.copy(), truth.t.copy(), truth.delta.copy())
     parts = []
     for first in range(0, draws, BATCH):
         b = min(BATCH, draws - first)
@@ -89,23 +89,12 @@ def draw(
         parts.append(
             solve_batch(
                 np.ascontiguousarray(x),
-                weighted.W,
-                ones,
                 np.ascontiguousarray(R),
                 np.ascontiguousarray(t),
-                problem.alpha,
-                problem.run,
-                problem.ball,
-                problem.s_0,
-                free.cols,
-                free.col_run,
-                free.factor,
-                free.information,
+                rows_of(weighted),
+                freed_of(problem, free),
                 np.ascontiguousarray(prior),
-                np.ascontiguousarray(truth.R_HT),
-                truth.t_HT.copy(),
-                truth.t.copy(),
-                truth.delta.copy(),
+                start,
                 ITERATIONS,
             )
         )
