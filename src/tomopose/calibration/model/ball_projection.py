@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit
@@ -23,6 +23,9 @@ from tomopose.geometry.rotations import skew
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
+
+Two: TypeAlias = tuple[float, float]
+Three: TypeAlias = tuple[float, float, float]
 
 SCANNER_COLUMNS = (
     "d_SD",
@@ -79,6 +82,23 @@ def _table(s: Array, alpha: float, M: Array) -> None:
     M[2, 0], M[2, 1], M[2, 2] = k * a2 * a0 - d * a1, k * a2 * a1 + d * a0, c + k * a2 * a2
 
 
+class Projected(NamedTuple):
+    """Where one pose's projection and its derivatives are written.
+
+    x (2,) px;  x_H (3,), y_T = R_HT x_H (3,) mm;  G_H = dx/dx_H, G_T = dx/dx_T (2, 3);  J_s (2, 13) by SCANNER_COLUMNS;
+    R, M (3, 3): work space for the rotations of panel and table.
+    """
+
+    x: Array
+    x_H: Array
+    y_T: Array
+    G_H: Array
+    G_T: Array
+    J_s: Array
+    R: Array
+    M: Array
+
+
 @njit(cache=True)
 def project_pose(
     s: Array,
@@ -89,19 +109,13 @@ def project_pose(
     t: Array,
     alpha: float,
     derivatives: bool,
-    x: Array,
-    x_H: Array,
-    G_H: Array,
-    G_T: Array,
-    y_T: Array,
-    J_s: Array,
-    R: Array,
-    M: Array,
+    out: Projected,
 ) -> bool:
-    """One pose.  Writes x (2,), x_H (3,), G_H = dx/dx_H and G_T = dx/dx_T (2, 3), y_T = R_HT x_H (3,), J_s (2, 13).
+    """One pose, written into `out`; without `derivatives` only x, x_H and y_T.
 
-    R, M: (3, 3) work space.  False where the ball is not in front of the source.
+    False where the ball is not in front of the source.
     """
+    x, x_H, y_T, G_H, G_T, J_s, R, M = out
     scale = s[12]
     _panel(s, R)
     _table(s, alpha, M)
@@ -130,11 +144,10 @@ def project_pose(
     su0, su1, su2 = gu * (R[0, 0] - a * R[0, 2]), gu * (R[1, 0] - a * R[1, 2]), gu * (R[2, 0] - a * R[2, 2])
     sv0, sv1, sv2 = gv * (R[0, 1] - b * R[0, 2]), gv * (R[1, 1] - b * R[1, 2]), gv * (R[2, 1] - b * R[2, 2])
     # dx/dx_W = dx/dx_S R_WS
-    wu0, wu1, wu2 = -su2, -su0, su1
-    wv0, wv1, wv2 = -sv2, -sv0, sv1
+    wu, wv = (-su2, -su0, su1), (-sv2, -sv0, sv1)
     for i in range(3):
-        G_T[0, i] = wu0 * M[0, i] + wu1 * M[1, i] + wu2 * M[2, i]
-        G_T[1, i] = wv0 * M[0, i] + wv1 * M[1, i] + wv2 * M[2, i]
+        G_T[0, i] = wu[0] * M[0, i] + wu[1] * M[1, i] + wu[2] * M[2, i]
+        G_T[1, i] = wv[0] * M[0, i] + wv[1] * M[1, i] + wv[2] * M[2, i]
     for i in range(3):
         G_H[0, i] = G_T[0, 0] * R_HT[0, i] + G_T[0, 1] * R_HT[1, i] + G_T[0, 2] * R_HT[2, i]
         G_H[1, i] = G_T[1, 0] * R_HT[0, i] + G_T[1, 1] * R_HT[1, i] + G_T[1, 2] * R_HT[2, i]
@@ -144,34 +157,52 @@ def project_pose(
     J_s[0, 3], J_s[1, 3] = 0.0, -dv / s[3]
     J_s[0, 4], J_s[1, 4] = 1.0, 0.0
     J_s[0, 5], J_s[1, 5] = 0.0, 1.0
-    # panel angles: dR = [n]_x R with n = R e_z (eta), e_x (theta), R_x(theta) e_y (phi); dy = R^T (x_S x n)
+    _by_panel_angles(s[7], R, (X, Y, Z), (su0, su1, su2), (sv0, sv1, sv2), (f_u, a), (f_v, b), J_s)
+    _by_table_axis(s[10], (z0, z1, z2), (m0, m1, m2), wu, wv, G_T, J_s)
+    J_s[0, 12] = G_H[0, 0] * t_k[0] + G_H[0, 1] * t_k[1] + G_H[0, 2] * t_k[2]
+    J_s[1, 12] = G_H[1, 0] * t_k[0] + G_H[1, 1] * t_k[1] + G_H[1, 2] * t_k[2]
+    return True
+
+
+@njit(cache=True)
+def _by_panel_angles(
+    theta: float, R: Array, x_S: Three, su: Three, sv: Three, u: Two, v: Two, J_s: Array
+) -> None:  # fmt: skip
+    """Columns eta, theta, phi of J_s: dR = [n]_x R with n = R e_z, e_x, R_x(theta) e_y; dy = R^T (x_S x n).
+
+    su, sv: dx/dx_S;  u, v: (f_u, y_1 / y_3), (f_v, y_2 / y_3).
+    """
+    X, Y, Z = x_S
     for k in range(3):
         if k == 0:
             n0, n1, n2 = R[0, 2], R[1, 2], R[2, 2]
         elif k == 1:
             n0, n1, n2 = 1.0, 0.0, 0.0
         else:
-            n0, n1, n2 = 0.0, math.cos(s[7]), math.sin(s[7])
+            n0, n1, n2 = 0.0, math.cos(theta), math.sin(theta)
         c0, c1, c2 = Y * n2 - Z * n1, Z * n0 - X * n2, X * n1 - Y * n0
         # row 3 of [n]_x R
         r0, r1, r2 = n0 * R[1, 0] - n1 * R[0, 0], n0 * R[1, 1] - n1 * R[0, 1], n0 * R[1, 2] - n1 * R[0, 2]
-        J_s[0, 6 + k] = su0 * c0 + su1 * c1 + su2 * c2 + f_u * (r2 * a - r0)
-        J_s[1, 6 + k] = sv0 * c0 + sv1 * c1 + sv2 * c2 + f_v * (r2 * b - r1)
-    # table axis: x_W = M z + o with o = (0, axis_y, 0), z = x_T - o
-    J_s[0, 9] = wu1 - G_T[0, 1]
-    J_s[1, 9] = wv1 - G_T[1, 1]
+        J_s[0, 6 + k] = su[0] * c0 + su[1] * c1 + su[2] * c2 + u[0] * (r2 * u[1] - r0)
+        J_s[1, 6 + k] = sv[0] * c0 + sv[1] * c1 + sv[2] * c2 + v[0] * (r2 * v[1] - r1)
+
+
+@njit(cache=True)
+def _by_table_axis(tilt_x: float, z: Three, m: Three, wu: Three, wv: Three, G_T: Array, J_s: Array) -> None:
+    """Columns axis_y, axis_tilt_x, axis_tilt_y of J_s: x_W = M z + o with o = (0, axis_y, 0), z = x_T - o, m = M z.
+
+    wu, wv: dx/dx_W.  dM = [c]_x M - M [c]_x with c = e_x, then R_x(tilt_x) e_y.
+    """
+    J_s[0, 9] = wu[1] - G_T[0, 1]
+    J_s[1, 9] = wv[1] - G_T[1, 1]
     for k in range(2):
-        # dM = [c]_x M - M [c]_x with c = e_x, then R_x(tilt_x) e_y
         c0 = 1.0 if k == 0 else 0.0
-        c1 = 0.0 if k == 0 else math.cos(s[10])
-        c2 = 0.0 if k == 0 else math.sin(s[10])
-        p0, p1, p2 = c1 * m2 - c2 * m1, c2 * m0 - c0 * m2, c0 * m1 - c1 * m0
-        q0, q1, q2 = c1 * z2 - c2 * z1, c2 * z0 - c0 * z2, c0 * z1 - c1 * z0
-        J_s[0, 10 + k] = wu0 * p0 + wu1 * p1 + wu2 * p2 - G_T[0, 0] * q0 - G_T[0, 1] * q1 - G_T[0, 2] * q2
-        J_s[1, 10 + k] = wv0 * p0 + wv1 * p1 + wv2 * p2 - G_T[1, 0] * q0 - G_T[1, 1] * q1 - G_T[1, 2] * q2
-    J_s[0, 12] = G_H[0, 0] * t_k[0] + G_H[0, 1] * t_k[1] + G_H[0, 2] * t_k[2]
-    J_s[1, 12] = G_H[1, 0] * t_k[0] + G_H[1, 1] * t_k[1] + G_H[1, 2] * t_k[2]
-    return True
+        c1 = 0.0 if k == 0 else math.cos(tilt_x)
+        c2 = 0.0 if k == 0 else math.sin(tilt_x)
+        p0, p1, p2 = c1 * m[2] - c2 * m[1], c2 * m[0] - c0 * m[2], c0 * m[1] - c1 * m[0]
+        q0, q1, q2 = c1 * z[2] - c2 * z[1], c2 * z[0] - c0 * z[2], c0 * z[1] - c1 * z[0]
+        J_s[0, 10 + k] = wu[0] * p0 + wu[1] * p1 + wu[2] * p2 - G_T[0, 0] * q0 - G_T[0, 1] * q1 - G_T[0, 2] * q2
+        J_s[1, 10 + k] = wv[0] * p0 + wv[1] * p1 + wv[2] * p2 - G_T[1, 0] * q0 - G_T[1, 1] * q1 - G_T[1, 2] * q2
 
 
 @njit(cache=True)
@@ -191,24 +222,8 @@ def _project_all(
     G_H, G_T, J_s = np.zeros((n, 2, 3)), np.zeros((n, 2, 3)), np.zeros((n, 2, 13))
     R, M = np.empty((3, 3)), np.empty((3, 3))
     for k in range(n):
-        project_pose(
-            s[run[k]],
-            R_HT,
-            t_HT,
-            R_k[k],
-            t_k[k],
-            t[k],
-            alpha[k],
-            derivatives,
-            x[k],
-            x_H[k],
-            G_H[k],
-            G_T[k],
-            y_T[k],
-            J_s[k],
-            R,
-            M,
-        )
+        out = Projected(x[k], x_H[k], y_T[k], G_H[k], G_T[k], J_s[k], R, M)
+        project_pose(s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[k], alpha[k], derivatives, out)
     return x, x_H, y_T, G_H, G_T, J_s
 
 

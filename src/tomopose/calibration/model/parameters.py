@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -61,7 +62,7 @@ class FreeParameters:
     def __len__(self) -> int:
         return len(self.names)
 
-    @property
+    @cached_property
     def information(self) -> Array:
         """(f,) 1 / sigma^2."""
         return np.where(np.isfinite(self.sigma), 1.0 / np.asarray(self.sigma) ** 2, 0.0)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from tomopose.calibration.model.ball_projection import project_pose
+from tomopose.calibration.model.ball_projection import Projected, project_pose
 from tomopose.units import Array
 
 CONVERGED, STALLED, OUT_OF_ITERATIONS, SINGULAR = 0, 1, 2, 3
@@ -116,56 +116,59 @@ def _scanner_vectors(freed: Freed, delta: Array, s: Array) -> None:
 @njit(cache=True)
 def centres(rows: Rows, freed: Freed, at: Point) -> Array:
     """(n, 2) px: the calculated centres, without derivatives; NaN where a ball is behind the source."""
-    n = rows.R.shape[0]
-    out = np.full((n, 2), np.nan)
-    x_H, y_T, G_H, G_T = np.empty(3), np.empty(3), np.empty((2, 3)), np.empty((2, 3))
-    J_s, R, M = np.empty((2, 13)), np.empty((3, 3)), np.empty((3, 3))
+    R, t, alpha, run, ball = rows.R, rows.t, rows.alpha, rows.run, rows.ball
+    R_HT, t_HT, balls, _ = at
+    n = R.shape[0]
+    x = np.full((n, 2), np.nan)
+    work = _work_space()
+    found = work.x
     s = freed.s_0.copy()
     _scanner_vectors(freed, at.delta, s)
     for k in range(n):
-        project_pose(
-            s[rows.run[k]], at.R_HT, at.t_HT, rows.R[k], rows.t[k], at.t[rows.ball[k]], rows.alpha[k], False, out[k],
-            x_H, G_H, G_T, y_T, J_s, R, M,
-        )  # fmt: skip
-    return out
+        if project_pose(s[run[k]], R_HT, t_HT, R[k], t[k], balls[ball[k]], alpha[k], False, work):
+            x[k, 0], x[k, 1] = found[0], found[1]
+    return x
 
 
 @njit(cache=True)
-def normal_equations(rows: Rows, s: Array, freed: Freed, at: Point, derivatives: bool, N: Array, g: Array) -> float:
-    """chi2 at a point; with `derivatives` also N = J^T J and g = J^T r (r = observed - calculated, whitened).
+def _work_space() -> Projected:
+    return Projected(
+        np.empty(2), np.empty(3), np.empty(3), np.empty((2, 3)), np.empty((2, 3)), np.zeros((2, 13)),
+        np.empty((3, 3)), np.empty((3, 3)),
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def normal_equations(rows: Rows, s: Array, freed: Freed, at: Point, N: Array, g: Array) -> float:
+    """chi2 at a point, and N = J^T J and g = J^T r there (r = observed - calculated, whitened).
 
     s (runs, 13): scanner vectors at the point.  Infinite where a ball is behind the source.
     """
-    W, weight, R_k, run, ball = rows.W, rows.weight, rows.R, rows.run, rows.ball
-    cols, col_run, factor, information, delta = freed.cols, freed.col_run, freed.factor, freed.information, at.delta
-    n, n_b, n_f = rows.x.shape[0], at.t.shape[0], cols.shape[0]
-    x, x_H, y_T = np.empty(2), np.empty(3), np.empty(3)
-    G_H, G_T, J_s = np.empty((2, 3)), np.empty((2, 3)), np.zeros((2, 13))
-    R, M = np.empty((3, 3)), np.empty((3, 3))
+    # a tuple's array that is read in the loop costs two counts of references each time: name them before
+    x_meas, W, weight, R_k, t_k, alpha, run, ball = rows
+    _, cols, col_run, factor, information = freed
+    R_HT, t_HT, t, delta = at
+    work = _work_space()
+    x, _, y_T, G_H, G_T, J_s, _, _ = work
+    n, n_b, n_f = x_meas.shape[0], t.shape[0], cols.shape[0]
     w = 9 + n_f
     a, b, where = np.empty(w), np.empty(w), np.empty(w, dtype=np.int64)
     chi2 = 0.0
-    if derivatives:
-        N[:] = 0.0
-        g[:] = 0.0
-        for i in range(6):
-            where[i] = i
-        for j in range(n_f):
-            where[9 + j] = 6 + 3 * n_b + j
+    N[:] = 0.0
+    g[:] = 0.0
+    for i in range(6):
+        where[i] = i
+    for j in range(n_f):
+        where[9 + j] = 6 + 3 * n_b + j
     for k in range(n):
         if weight[k] == 0.0:
             continue
-        if not project_pose(
-            s[run[k]], at.R_HT, at.t_HT, R_k[k], rows.t[k], at.t[ball[k]], rows.alpha[k], derivatives, x,
-            x_H, G_H, G_T, y_T, J_s, R, M,
-        ):  # fmt: skip
+        if not project_pose(s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[ball[k]], alpha[k], True, work):
             return np.inf
-        du, dv = rows.x[k, 0] - x[0], rows.x[k, 1] - x[1]
+        du, dv = x_meas[k, 0] - x[0], x_meas[k, 1] - x[1]
         r0 = W[k, 0, 0] * du + W[k, 0, 1] * dv
         r1 = W[k, 1, 0] * du + W[k, 1, 1] * dv
         chi2 += weight[k] * (r0 * r0 + r1 * r1)
-        if not derivatives:
-            continue
         for e in range(2):
             c = a if e == 0 else b
             c[0] = y_T[1] * G_T[e, 2] - y_T[2] * G_T[e, 1]
@@ -189,13 +192,11 @@ def normal_equations(rows: Rows, s: Array, freed: Freed, at: Point, derivatives:
                 N[wi, where[j]] += p * a[j] + q * b[j]
     for j in range(n_f):
         chi2 += information[j] * delta[j] * delta[j]
-        if derivatives:
-            g[6 + 3 * n_b + j] -= information[j] * delta[j]
-            N[6 + 3 * n_b + j, 6 + 3 * n_b + j] += information[j]
-    if derivatives:
-        for i in range(g.shape[0]):
-            for j in range(i):
-                N[j, i] = N[i, j]
+        g[6 + 3 * n_b + j] -= information[j] * delta[j]
+        N[6 + 3 * n_b + j, 6 + 3 * n_b + j] += information[j]
+    for i in range(g.shape[0]):
+        for j in range(i):
+            N[j, i] = N[i, j]
     return chi2
 
 
@@ -224,7 +225,7 @@ def levenberg_marquardt(rows: Rows, freed: Freed, at: Point, iterations: int, N:
     s = freed.s_0.copy()
     trial = Point(at.R_HT.copy(), at.t_HT.copy(), at.t.copy(), at.delta.copy())
     _scanner_vectors(freed, at.delta, s)
-    chi2 = normal_equations(rows, s, freed, at, True, N, g)
+    chi2 = normal_equations(rows, s, freed, at, N, g)
     if not chi2 < np.inf:
         return np.inf, SINGULAR
     lam, grow = 1e-4, 2.0
@@ -240,7 +241,7 @@ def levenberg_marquardt(rows: Rows, freed: Freed, at: Point, iterations: int, N:
             gain += step[i] * (g[i] + lam * N[i, i] * step[i])
         _moved(at, step, trial)
         _scanner_vectors(freed, trial.delta, s)
-        chi2_new = normal_equations(rows, s, freed, trial, True, N_new, g_new)
+        chi2_new = normal_equations(rows, s, freed, trial, N_new, g_new)
         small = length < STEP_TOLERANCE * STEP_TOLERANCE
         if chi2_new < chi2 or (small and chi2_new < np.inf) or chi2_new == chi2:
             ratio = (chi2 - chi2_new) / gain if gain > 0 else 1.0

@@ -184,39 +184,53 @@ def thinned_pixels(window, good, origin, area, every, many, near):  # type: igno
     every: one pixel in so many is taken, on a lattice that has as large a share in each row and column.  Of more than
     `many` every second one is left out that lies farther than `near` from the centre.
     """
-    rows, columns = window.shape
-    middle_u, middle_v, low, high, ratio_u, ratio_v = area
-    u_first, v_first = origin
-    n, near_square, thinned = 0, np.inf, False
-    for turn in range(2):
-        if turn == 1:
-            u, v, value = np.empty(n), np.empty(n), np.empty(n)
-            thinned = n > many
-            near_square = near * near if thinned else np.inf
-        n = 0
-        for j in range(rows):
-            dv = (j - middle_v) * ratio_v
-            rest = high * high - dv * dv
-            if rest < 0.0:
-                continue
-            reach = math.sqrt(rest) / ratio_u
-            gap = low * low - dv * dv if low > 0.0 else -1.0
-            hole = math.sqrt(gap) / ratio_u if gap > 0.0 else -1.0
-            first = math.ceil(min(max(middle_u - reach, 0.0), float(columns)))
-            last = math.floor(min(max(middle_u + reach, -1.0), columns - 1.0))
-            for side in range(2 if hole >= 0.0 else 1):
-                start = first if side == 0 else max(first, math.ceil(min(max(middle_u + hole, 0.0), float(columns))))
-                inner = math.floor(min(max(middle_u - hole, -1.0), columns - 1.0))
-                stop = min(last, inner) if side == 0 and hole >= 0.0 else last
-                for i in range(start + (-start - 2 * j) % every, stop + 1, every):
-                    du = (i - middle_u) * ratio_u
-                    far = du * du + dv * dv > near_square and (i + u_first + j + v_first) % 2 == 1
-                    if far or not good[j, i]:
-                        continue
-                    if turn == 1:
-                        u[n], v[n], value[n] = i + u_first, j + v_first, window[j, i]
-                    n += 1
+    none = np.empty(0)
+    n = _annulus(window, good, origin, area, every, np.inf, none, none, none)
+    thinned = n > many
+    u, v, value = np.empty(n), np.empty(n), np.empty(n)
+    n = _annulus(window, good, origin, area, every, near * near if thinned else np.inf, u, v, value)
     return u[:n], v[:n], value[:n], thinned
+
+
+@njit(cache=True)
+def _annulus(window, good, origin, area, every, near_square, u, v, value):  # type: ignore[no-untyped-def]
+    """Number of good pixels in the annulus, of those beyond near_square every second one; u, v, value (n or more) are
+    filled where they are not empty."""
+    middle_u, middle_v, _, _, ratio_u, ratio_v = area
+    u_first, v_first = origin
+    fill, n = u.shape[0] > 0, 0
+    for j in range(window.shape[0]):
+        dv = (j - middle_v) * ratio_v
+        for start, stop in _spans(dv * dv, window.shape[1], area):
+            for i in range(start + (-start - 2 * j) % every, stop + 1, every):
+                du = (i - middle_u) * ratio_u
+                far = du * du + dv * dv > near_square and (i + u_first + j + v_first) % 2 == 1
+                if far or not good[j, i]:
+                    continue
+                if fill:
+                    u[n], v[n], value[n] = i + u_first, j + v_first, window[j, i]
+                n += 1
+    return n
+
+
+@njit(cache=True)
+def _spans(dv_square, columns, area):  # type: ignore[no-untyped-def]
+    """First and last column on both sides of the hole in a row at that squared distance from the centre; a span ends
+    before it begins where there is none."""
+    middle_u, _, low, high, ratio_u, _ = area
+    rest = high * high - dv_square
+    if rest < 0.0:
+        return (0, -1), (0, -1)
+    reach = math.sqrt(rest) / ratio_u
+    first = math.ceil(min(max(middle_u - reach, 0.0), float(columns)))
+    last = math.floor(min(max(middle_u + reach, -1.0), columns - 1.0))
+    gap = low * low - dv_square if low > 0.0 else -1.0
+    if gap <= 0.0:
+        return (first, last), (0, -1)
+    hole = math.sqrt(gap) / ratio_u
+    inner = math.floor(min(max(middle_u - hole, -1.0), columns - 1.0))
+    outer = math.ceil(min(max(middle_u + hole, 0.0), float(columns)))
+    return (first, min(last, inner)), (max(first, outer), last)
 
 
 @njit(cache=True, fastmath=True)

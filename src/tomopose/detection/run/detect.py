@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -83,59 +83,108 @@ def detect(
                 exchanged); where the ball has 20 % more or less than its nominal size in every image.
     """
     require_types(scanner, settings)
+    run = _run(
+        images, scanner, diameters=_Diameters(ball_diameter, ball_id), pose_id=pose_id, predicted=predicted,
+        origin=origin, journal=journal, settings=settings,
+    )  # fmt: skip
+    rows = _measured(run, workers=workers, executor=executor, progress=progress)
+    refuse_unusable(rows, settings.run)
+    found = _observations(run.diameters.judged(rows, scanner, settings), run.ids, run.names, settings)
+    found = found.with_ball_diameter(run.diameters.common)
+    balls = run.diameters.ball_id
+    return found if balls is None else replace(found, ball_id=balls)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Run:
+    """The images in order, with what is known of each beforehand.
+
+    total: number of images, 0 where it is not known.  names, ids, predicted (n, 2) px: one for each image, or None.
+    done: rows of an earlier run by name, from the journal.
+    """
+
+    images: Iterable[Any]
+    total: int
+    work: Work
+    diameters: _Diameters
+    names: tuple[str, ...] | None
+    ids: tuple[str, ...] | None
+    predicted: Array | None
+    origin: tuple[int, int] | Sequence[tuple[int, int]]
+    journal: Path | None
+    done: Mapping[str, Row]
+
+    def task(self, i: int) -> Task:
+        where = self.predicted
+        at = None if where is None or i >= len(where) else (float(where[i, 0]), float(where[i, 1]))
+        own, others = self.diameters.at(i)
+        name = self.names[i] if self.names is not None else str(i)
+        if self.diameters.given_ids is not None:
+            name = f"{name} ball {self.diameters.given_ids[i]}"
+        return Task(
+            name=name, ball_diameter=own, other_diameters=others, predicted=at, origin=_origin_of(self.origin, i)
+        )  # fmt: skip
+
+    def tasks(self) -> Iterator[tuple[Image, Task, Row | None]]:
+        """(image, its task, its row of an earlier run); the next lazy image comes from the disk meanwhile."""
+        images = self.images
+        lazy = hasattr(images, "region") and hasattr(images, "__len__")
+        source = (LazyImage(images, i) for i in range(self.total)) if lazy else images
+        for i, image in enumerate(source):
+            if lazy and hasattr(images, "fetch") and i + 1 < self.total:
+                _fetch(images, i + 1, self.task(i + 1), self.work.scanner)
+            task = self.task(i)
+            yield image, task, self.done.get(task.name)
+
+
+def _run(
+    images: Iterable[Any], scanner: Scanner, *, diameters: _Diameters, pose_id: Iterable[Any] | None,
+    predicted: npt.ArrayLike | None, origin: tuple[int, int] | Sequence[tuple[int, int]], journal: str | Path | None,
+    settings: DetectionSettings,
+) -> _Run:  # fmt: skip
+    """The run that `detect` is asked for; InputError where the counts disagree.  Opens the journal."""
     total = len(images) if isinstance(images, Sized) else 0
     names = getattr(images, "names", None)
     names = None if names is None else tuple(str(n) for n in names)
     ids = None if pose_id is None else tuple(str(i) for i in pose_id)
     where = None if predicted is None else np.asarray(predicted, dtype=np.float64).reshape(-1, 2)
-    columns = {"pose ids": ids, "predicted positions": where, "image names": names, "ball ids": ball_id}
+    columns = {"pose ids": ids, "predicted positions": where, "image names": names, "ball ids": diameters.given_ids}
     for name, given in columns.items():
         if total and given is not None and len(given) != total:
             raise InputError(f"{total} images but {len(given)} {name}; one for each image is needed")
-    diameters = _Diameters(ball_diameter, ball_id)
     work = Work(scanner=scanner, mask=getattr(images, "mask", None), settings=settings, keyed=journal is not None)
     path = None if journal is None else Path(journal)
     done: dict[str, Row] = {}
     if path is not None:
         key = key_of("detection-journal", scanner=scanner, balls=diameters.words, mask=work.mask, settings=settings)
         done = open_journal(path, key)
+    return _Run(
+        images=images, total=total, work=work, diameters=diameters, names=names, ids=ids, predicted=where,
+        origin=origin, journal=path, done=done,
+    )  # fmt: skip
 
-    def task_of(i: int) -> Task:
-        at = None if where is None or i >= len(where) else (float(where[i, 0]), float(where[i, 1]))
-        own, others = diameters.at(i)
-        name = names[i] if names is not None else str(i)
-        if ball_id is not None:
-            name = f"{name} ball {ball_id[i]}"
-        return Task(name=name, ball_diameter=own, other_diameters=others, predicted=at, origin=_origin_of(origin, i))
 
-    def tasks() -> Iterator[tuple[Image, Task, Row | None]]:
-        lazy = hasattr(images, "region") and hasattr(images, "__len__")
-        source = (LazyImage(images, i) for i in range(total)) if lazy else images
-        for i, image in enumerate(source):
-            if lazy and hasattr(images, "fetch") and i + 1 < total:
-                _fetch(images, i + 1, task_of(i + 1), scanner)
-            task = task_of(i)
-            yield image, task, done.get(task.name)
-
+def _measured(
+    run: _Run, *, workers: int, executor: Any, progress: Callable[[int, int], None] | None
+) -> list[Row]:  # fmt: skip
+    """The row of each image, in order, freed of the share that the previous ball left; kept in the journal."""
     rows: list[Row] = []
     before: dict[float, Before] = {}
     lags: list[Lag] = []
-    for (image, task, _), row in ordered_map(partial(row_of, work=work), tasks(), workers=workers, executor=executor):
-        if path is not None and row != done.get(row["name"]):
-            append(path, row)
-        if rows and np.ndim(origin) == 1:
+    measure = partial(row_of, work=run.work)
+    for (image, task, _), row in ordered_map(measure, run.tasks(), workers=workers, executor=executor):
+        if run.journal is not None and row != run.done.get(row["name"]):
+            append(run.journal, row)
+        if rows and np.ndim(run.origin) == 1:
             refuse_another_form(rows[0], row)
         held = np.asarray(image) if not isinstance(image, LazyImage) and "x_D" in row else image
-        row, lag = with_lag(row, held, before.get(task.ball_diameter), task, work=work)
+        row, lag = with_lag(row, held, before.get(task.ball_diameter), task, work=run.work)
         rows.append(row)
         lags += [lag] if lag.share > 0 else []
         before[task.ball_diameter] = Before(row, held if "x_D" in row else NOTHING, usual_lag(lags))
         if progress is not None:
-            progress(len(rows), total)
-    refuse_unusable(rows, settings.run)
-    found = _observations(diameters.judged(rows, scanner, settings), ids, names, settings)
-    found = found.with_ball_diameter(diameters.common)
-    return found if diameters.ball_id is None else replace(found, ball_id=diameters.ball_id)
+            progress(len(rows), run.total)
+    return rows
 
 
 NOTHING = np.zeros((0, 0))
@@ -148,6 +197,7 @@ class _Diameters:
     def __init__(
         self, given: float | Mapping[int, float], ball_id: Sequence[int] | npt.NDArray[np.int64] | None
     ) -> None:  # fmt: skip
+        self.given_ids = ball_id
         if isinstance(given, Mapping):
             self.by_ball = {int(b): checked_diameter(d) for b, d in given.items()}
             if ball_id is None and len(self.by_ball) != 1:
