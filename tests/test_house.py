@@ -23,8 +23,6 @@ TO_BE_SPLIT = {
     "calibration/model/problem.py:pair",
     "calibration/solve.py:calibrate",
     "calibration/solve.py:rigid_calibration",
-    "engines/vector.py:block",
-    "engines/vector.py:forward_block",
 }
 """Functions that are still longer, deeper or of more parameters; the list may only become shorter."""
 ROOMS_TO_BE_SPLIT = {"io/images"}

@@ -9,9 +9,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tomopose.engines import make_engine
+from tomopose.engines.back_projection import back_columns
 from tomopose.engines.cpu import CpuEngine
+from tomopose.engines.forward_projection import forward_columns
 from tomopose.engines.geometry import index_geometry
-from tomopose.engines.kernels import BORDER, Lookup, Rays, Support, back_columns, forward_columns
+from tomopose.engines.layout import BORDER, Lookup, Rays, Support
 from tomopose.geometry.projection import ProjectionMatrices, compose
 from tomopose.geometry.rotations import R_y, R_z
 from tomopose.volume import VoxelGrid

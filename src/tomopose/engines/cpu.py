@@ -9,9 +9,11 @@ from typing import Literal
 
 import numpy as np
 
-from tomopose.engines import kernels, vector
+from tomopose.engines import vector
+from tomopose.engines.back_projection import back_columns
+from tomopose.engines.forward_projection import forward_columns, ray_lengths, scatter_planes
 from tomopose.engines.geometry import index_geometry
-from tomopose.engines.kernels import BORDER, MARGIN, TILE, Lookup, Rays, Support
+from tomopose.engines.layout import BORDER, MARGIN, TILE, Lookup, Rays, Support
 from tomopose.engines.protocol import Availability, Limits, Weight, require_images, require_support, require_views
 from tomopose.errors import InputError
 from tomopose.geometry.projection import ProjectionMatrices
@@ -27,7 +29,7 @@ def processors() -> int:
 
 
 class CpuEngine:
-    """Vector kernels (`kernels="vector"`) or the plain ones (`"plain"`) on `threads` threads; see kernels.py.
+    """Vector kernels (`kernels="vector"`) or the plain ones (`"plain"`) on `threads` threads; see layout.py.
 
     Results do not depend on the number of threads: no two write to one voxel or pixel.
     """
@@ -62,7 +64,7 @@ class CpuEngine:
         self._geometry = index_geometry(matrices, grid)
         self._pool: ThreadPoolExecutor | None = None
 
-    # A volume is [x, y, z] with a margin of one zero voxel below and two above; see kernels.py.
+    # A volume is [x, y, z] with a margin of one zero voxel below and two above; see layout.py.
 
     def empty(self) -> np.ndarray:
         return np.zeros(tuple(n + MARGIN for n in self.grid.n_xyz), dtype=np.float32)
@@ -84,7 +86,7 @@ class CpuEngine:
             rays = self._rays(j)
 
             def part(start: int, stop: int, image: np.ndarray = image, rays: Rays = rays) -> None:
-                kernels.forward_columns(flat, rays, image, self.vector, start, stop)
+                forward_columns(flat, rays, image, self.vector, start, stop)
 
             self._share(part, self.matrices.n_u, RAY_COLUMNS)
         return lines.transpose(0, 2, 1)
@@ -121,7 +123,7 @@ class CpuEngine:
         flat, mean = into.reshape(-1), weight == "mean"
 
         def part(start: int, stop: int) -> None:
-            kernels.back_columns(flat, self.grid.n_xyz, look, mean, nonnegative, self._support, start, stop)
+            back_columns(flat, self.grid.n_xyz, look, mean, nonnegative, self._support, start, stop)
 
         self._share(part, self.grid.n_xyz[0], TILE)
 
@@ -134,7 +136,7 @@ class CpuEngine:
             for axis, n in enumerate(self.grid.n_xyz):
 
                 def part(start: int, stop: int, axis: int = axis, lines: np.ndarray = lines, rays: Rays = rays) -> None:
-                    kernels.scatter_planes(flat, rays, lines, axis, start, stop)
+                    scatter_planes(flat, rays, lines, axis, start, stop)
 
                 self._share(part, n, max(TILE, n // (2 * self.threads)))
         for axis in range(3):
@@ -146,7 +148,7 @@ class CpuEngine:
         require_views(views, len(self.matrices))
         lines = np.empty((len(views), self.matrices.n_u, self.matrices.n_v), dtype=np.float32)
         for image, j in zip(lines, views, strict=True):
-            kernels.ray_lengths(self._rays(j), image, 0, self.matrices.n_u)
+            ray_lengths(self._rays(j), image, 0, self.matrices.n_u)
         return lines.transpose(0, 2, 1)
 
     def _rays(self, j: int) -> Rays:

@@ -4,12 +4,14 @@ Numba's own vectoriser turns neither the bilinear look-up of back-projection nor
 loads are gathers and the stores may alias.  The blocks below say it to LLVM directly.  A bilinear look-up takes two
 loads a lane, the pair of neighbours along the fastest axis as one 64 bit word; with AVX-512 most blocks take four whole
 rows and a permutation instead.  LLVM maps the vectors to whatever the processor has; W is 16 with AVX-512 and 8
-elsewhere.  The same results come from the plain kernels in kernels.py.
+elsewhere.  The same results come from the plain kernels in back_projection.py and
+forward_projection.py.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
 import llvmlite.binding
 from llvmlite import ir
@@ -19,7 +21,14 @@ from numba.extending import intrinsic as untyped_intrinsic
 
 # numba is typed in parts only; what a checker would take from those parts is wrong for code generation.
 cgutils: Any = untyped_cgutils
-intrinsic: Any = untyped_intrinsic
+intrinsic: Callable[[Callable[..., object]], Callable[..., None]] = untyped_intrinsic
+
+Context: TypeAlias = Any
+"""numba's typing or code generation context, and what an intrinsic hands over: numba has no types for them."""
+Signature: TypeAlias = Any
+Arguments: TypeAlias = Sequence[ir.Value]
+Block: TypeAlias = Callable[..., None]
+Intrinsic: TypeAlias = tuple[Signature, Callable[..., ir.Value]]
 
 F32, I32, I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 
@@ -39,34 +48,34 @@ BIAS = 1 << 30
 VF, VI = ir.VectorType(F32, W), ir.VectorType(I32, W)
 
 
-def _splat(builder: Any, x: Any) -> Any:
+def _splat(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
     vector = ir.VectorType(x.type, W)
     one = builder.insert_element(ir.Constant(vector, ir.Undefined), x, ir.Constant(I32, 0))
     return builder.shuffle_vector(one, ir.Constant(vector, ir.Undefined), ir.Constant(VI, [0] * W))
 
 
-def _call(builder: Any, name: str, *arguments: Any) -> Any:
+def _call(builder: ir.IRBuilder, name: str, *arguments: ir.Value) -> ir.Value:
     kind = ir.FunctionType(VF, [VF] * len(arguments))
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{W}f32"), arguments)
 
 
-def _data(context: Any, builder: Any, array_type: Any, array: Any) -> Any:
+def _data(context: Context, builder: ir.IRBuilder, array_type: types.Type, array: ir.Value) -> ir.Value:
     return cgutils.create_struct_proxy(array_type)(context, builder, array).data
 
 
-def _count(context: Any, builder: Any, array_type: Any, array: Any) -> Any:
+def _count(context: Context, builder: ir.IRBuilder, array_type: types.Type, array: ir.Value) -> ir.Value:
     return cgutils.create_struct_proxy(array_type)(context, builder, array).nitems
 
 
-def _at(builder: Any, data: Any, index: Any, kind: Any) -> Any:
+def _at(builder: ir.IRBuilder, data: ir.Value, index: ir.Value, kind: ir.Type) -> ir.Value:
     return builder.bitcast(builder.gep(data, [index], source_etype=F32), kind.as_pointer())
 
 
-def _load(builder: Any, data: Any, index: Any) -> Any:
+def _load(builder: ir.IRBuilder, data: ir.Value, index: ir.Value) -> ir.Value:
     return builder.load(_at(builder, data, index, VF), align=4, typ=VF)
 
 
-def _pairs(builder: Any, data: Any, base: Any, offset: Any) -> tuple[Any, Any]:
+def _pairs(builder: ir.IRBuilder, data: ir.Value, base: ir.Value, offset: ir.Value) -> tuple[ir.Value, ir.Value]:
     """Lane by lane, data[base + offset] and its right neighbour."""
     words = ir.Constant(ir.VectorType(I64, W), ir.Undefined)
     # With a bias the offsets are positive, and widening an unsigned lane to an address costs nothing.
@@ -83,20 +92,22 @@ def _pairs(builder: Any, data: Any, base: Any, offset: Any) -> tuple[Any, Any]:
     return builder.shuffle_vector(both, undefined, even), builder.shuffle_vector(both, undefined, odd)
 
 
-def _all(builder: Any, mask: Any) -> Any:
+def _all(builder: ir.IRBuilder, mask: ir.Value) -> ir.Value:
     """Whether every lane of a mask is set."""
     bits = ir.IntType(W)
     return builder.icmp_unsigned("==", builder.bitcast(mask, bits), ir.Constant(bits, -1))
 
 
-def _pick(builder: Any, low: Any, high: Any, index: Any) -> Any:
+def _pick(builder: ir.IRBuilder, low: ir.Value, high: ir.Value, index: ir.Value) -> ir.Value:
     """Lanes of two vectors side by side, by index 0 .. 31 (AVX-512's vpermi2ps)."""
     kind = ir.FunctionType(VF, [VF, VI, VF])
     function = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512.vpermi2var.ps.512")
     return builder.call(function, [low, index, high])
 
 
-def _near(builder: Any, data: Any, start: Any, row: Any, d_a: Any, d_b: Any, rows: int) -> tuple[Any, ...]:
+def _near(
+    builder: ir.IRBuilder, data: ir.Value, start: ir.Value, row: ir.Value, d_a: ir.Value, d_b: ir.Value, rows: int
+) -> tuple[ir.Value, ...]:
     """The four neighbours of lanes that lie within `rows` - 1 rows and 31 columns: whole rows loaded, lanes picked."""
     step = builder.sext(row, I64)
     one, width = ir.Constant(VI, [1] * W), ir.Constant(I64, W)
@@ -111,14 +122,16 @@ def _near(builder: Any, data: Any, start: Any, row: Any, d_a: Any, d_b: Any, row
     return tuple(builder.select(upper, picked[r + 1][side], picked[r][side]) for r in (0, 1) for side in (0, 1))
 
 
-def _neighbours(builder: Any, data: Any, count: Any, base: Any, row: Any, i_a: Any, i_b: Any) -> tuple[Any, ...]:
+def _neighbours(
+    builder: ir.IRBuilder, data: ir.Value, count: ir.Value, base: ir.Value, row: ir.Value, i_a: ir.Value, i_b: ir.Value
+) -> tuple[ir.Value, ...]:
     """data at (i_a, i_b), (i_a, i_b + 1), (i_a + 1, i_b), (i_a + 1, i_b + 1), lane by lane.
 
     Adjacent lanes mostly want adjacent elements.  With AVX-512, lanes that share a row (or two) and 31 columns are
     picked out of whole rows; other lanes are loaded pair by pair.  No row is read beyond `count` elements.
     """
 
-    def one_by_one() -> tuple[Any, ...]:
+    def one_by_one() -> tuple[ir.Value, ...]:
         offset = builder.add(builder.mul(i_a, _splat(builder, row)), i_b)
         return (
             *_pairs(builder, data, base, offset),
@@ -129,11 +142,11 @@ def _neighbours(builder: Any, data: Any, count: Any, base: Any, row: Any, i_a: A
         return one_by_one()
     found = [cgutils.alloca_once(builder, VF) for _ in range(4)]
 
-    def keep(values: tuple[Any, ...]) -> None:
+    def keep(values: tuple[ir.Value, ...]) -> None:
         for place, value in zip(found, values, strict=True):
             builder.store(value, place)
 
-    def smaller_end(index: Any) -> Any:
+    def smaller_end(index: ir.Value) -> ir.Value:
         first, last = (builder.extract_element(index, ir.Constant(I32, lane)) for lane in (0, W - 1))
         return builder.select(builder.icmp_signed("<", first, last), first, last)
 
@@ -157,7 +170,9 @@ def _neighbours(builder: Any, data: Any, count: Any, base: Any, row: Any, i_a: A
     return tuple(builder.load(place, typ=VF) for place in found)
 
 
-def _bilinear(builder: Any, data: Any, count: Any, base: Any, row: Any, a: Any, b: Any) -> Any:
+def _bilinear(
+    builder: ir.IRBuilder, data: ir.Value, count: ir.Value, base: ir.Value, row: ir.Value, a: ir.Value, b: ir.Value
+) -> ir.Value:
     """data at the fractional position (a, b): a counts rows of length `row` (int32), b is the contiguous axis."""
     floor_a, floor_b = _call(builder, "floor", a), _call(builder, "floor", b)
     f_a, f_b = builder.fsub(a, floor_a), builder.fsub(b, floor_b)
@@ -169,58 +184,62 @@ def _bilinear(builder: Any, data: Any, count: Any, base: Any, row: Any, a: Any, 
     return _call(builder, "fma", f_a, builder.fsub(high, low), low)
 
 
-def _back_block(inverse_square: bool) -> Any:
+def _weighted_pixels(
+    builder: ir.IRBuilder,
+    pixels: ir.Value,
+    count: ir.Value,
+    base: ir.Value,
+    row: ir.Value,
+    first: ir.Value,
+    place: ir.Value,
+    inverse_square: bool,
+) -> tuple[ir.Value, ir.Value]:
+    """(pixel values, weights) of W voxels; lanes below `first` look up the place of lane `first` and weigh nothing."""
+    scale, u, du, v, dv, w, dw = cgutils.unpack_tuple(builder, place, 7)
+    lanes = ir.Constant(VF, [float(lane) for lane in range(W)])
+    start = _splat(builder, builder.sitofp(first, F32))
+    active = builder.fcmp_ordered(">=", lanes, start)
+    lane = builder.select(active, lanes, start)
+
+    def along(origin: ir.Value, step: ir.Value) -> ir.Value:
+        return _call(builder, "fma", lane, _splat(builder, step), _splat(builder, origin))
+
+    reciprocal = builder.fdiv(ir.Constant(VF, [1.0] * W), along(w, dw))
+    a, b = builder.fmul(along(u, du), reciprocal), builder.fmul(along(v, dv), reciprocal)
+    value = _bilinear(builder, pixels, count, base, row, a, b)
+    weight = _splat(builder, scale)
+    if inverse_square:
+        weight = builder.fmul(weight, builder.fmul(reciprocal, reciprocal))
+    return value, builder.select(active, weight, ir.Constant(VF, [0.0] * W))
+
+
+def _back_block(inverse_square: bool) -> Block:
     @intrinsic
     def block(
-        typingctx: Any,
-        column: Any,
-        z: Any,
-        image: Any,
-        base: Any,
-        row: Any,
-        first: Any,
-        scale: Any,
-        u: Any,
-        du: Any,
-        v: Any,
-        dv: Any,
-        w: Any,
-        dw: Any,
-    ) -> Any:
+        typingctx: Context,
+        column: types.Type,
+        z: types.Type,
+        image: types.Type,
+        base: types.Type,
+        row: types.Type,
+        first: types.Type,
+        place: types.Type,
+    ) -> Intrinsic:
         """column[z + l] += weight * image at ((u + l du) / (w + l dw), (v + l dv) / (w + l dw)), lanes first <= l < W.
 
-        image[base] is the pixel the two quotients count from; weight is `scale`, or scale / (w + l dw)^2.
-        Lanes below `first` look up the place of lane `first` and add nothing.
+        place: (scale, u, du, v, dv, w, dw), float32.  image[base] is the pixel the two quotients count from; weight is
+        `scale`, or scale / (w + l dw)^2.
         """
-        f = types.float32
-        signature = types.void(column, types.int64, image, types.int64, types.int32, types.int32, f, f, f, f, f, f, f)
+        signature = types.void(
+            column, types.int64, image, types.int64, types.int32, types.int32, types.UniTuple(types.float32, 7)
+        )
 
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            column, z, image, base, row, first, scale, u, du, v, dv, w, dw = arguments
+        def generate(context: Context, builder: ir.IRBuilder, signature: Signature, arguments: Arguments) -> ir.Value:
+            column, z, image, base, row, first, place = arguments
             target = _data(context, builder, signature.args[0], column)
             pixels = _data(context, builder, signature.args[2], image)
-            lanes = ir.Constant(VF, [float(lane) for lane in range(W)])
-            start = _splat(builder, builder.sitofp(first, F32))
-            active = builder.fcmp_ordered(">=", lanes, start)
-            lane = builder.select(active, lanes, start)
-
-            def along(origin: Any, step: Any) -> Any:
-                return _call(builder, "fma", lane, _splat(builder, step), _splat(builder, origin))
-
-            reciprocal = builder.fdiv(ir.Constant(VF, [1.0] * W), along(w, dw))
-            value = _bilinear(
-                builder,
-                pixels,
-                _count(context, builder, signature.args[2], image),
-                base,
-                row,
-                builder.fmul(along(u, du), reciprocal),
-                builder.fmul(along(v, dv), reciprocal),
-            )
-            weight = _splat(builder, scale)
-            if inverse_square:
-                weight = builder.fmul(weight, builder.fmul(reciprocal, reciprocal))
-            weight = builder.select(active, weight, ir.Constant(VF, [0.0] * W))
+            count = _count(context, builder, signature.args[2], image)
+            value, weight = _weighted_pixels(builder, pixels, count, base, row, first, place, inverse_square)
             result = _call(builder, "fma", value, weight, _load(builder, target, z))
             builder.store(result, _at(builder, target, z, VF), align=4)
             return context.get_dummy_value()
@@ -234,27 +253,31 @@ back_block = _back_block(inverse_square=False)
 back_block_inverse_square = _back_block(inverse_square=True)
 
 
+def _held(builder: ir.IRBuilder, place: ir.Value, end: ir.Value) -> ir.Value:
+    """Positions held within [-1, end]."""
+    low = ir.Constant(VF, [-1.0] * W)
+    place = builder.select(builder.fcmp_ordered(">", place, low), place, low)
+    return builder.select(builder.fcmp_ordered("<", place, end), place, end)
+
+
 @intrinsic
 def forward_block(
-    typingctx: Any,
-    volume: Any,
-    base: Any,
-    plane: Any,
-    row: Any,
-    rays: Any,
-    k_0: Any,
-    k_1: Any,
-    centre: Any,
-    a_end: Any,
-    b_end: Any,
-    sums: Any,
-    at: Any,
-) -> Any:
-    """sums[at + l] = sum over planes k_0 <= k < k_1 of the volume at (a_l(k), b_l(k)): Joseph's sum for W rays.
+    typingctx: Context,
+    volume: types.Type,
+    base: types.Type,
+    plane: types.Type,
+    row: types.Type,
+    rays: types.Type,
+    planes: types.Type,
+    ends: types.Type,
+    sums: types.Type,
+) -> Intrinsic:
+    """sums[l] = sum over planes k_0 <= k < k_1 of the volume at (a_l(k), b_l(k)): Joseph's sum for W rays.
 
     volume[base] is voxel (0, 0) of plane 0; planes lie `plane` elements apart, rows along a `row` (int32), b is
-    contiguous.  rays holds a, da, b, db for each lane (4 W values): a(k) = a + (k - centre) da.  Positions are held
-    within [-1, a_end] and [-1, b_end], where the volume's margin is zero.
+    contiguous.  rays holds a, da, b, db for each lane (4 W values): a(k) = a + (k - centre) da.  planes: (k_0, k_1);
+    ends: (centre, a_end, b_end), float32.  Positions are held within [-1, a_end] and [-1, b_end], where the volume's
+    margin is zero.
     """
     signature = types.void(
         volume,
@@ -262,36 +285,30 @@ def forward_block(
         types.int64,
         types.int32,
         rays,
-        types.int64,
-        types.int64,
-        types.float32,
-        types.float32,
-        types.float32,
+        types.UniTuple(types.int64, 2),
+        types.UniTuple(types.float32, 3),
         sums,
-        types.int64,
     )
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        volume, base, plane, row, rays, k_0, k_1, centre, a_end, b_end, sums, at = arguments
+    def generate(context: Context, builder: ir.IRBuilder, signature: Signature, arguments: Arguments) -> ir.Value:
+        volume, base, plane, row, rays, planes, ends, sums = arguments
         voxels = _data(context, builder, signature.args[0], volume)
         count = _count(context, builder, signature.args[0], volume)
         table = _data(context, builder, signature.args[4], rays)
-        target = _data(context, builder, signature.args[10], sums)
+        target = _data(context, builder, signature.args[7], sums)
+        k_0, k_1 = cgutils.unpack_tuple(builder, planes, 2)
+        centre, a_end, b_end = cgutils.unpack_tuple(builder, ends, 3)
         a, da, b, db = (_load(builder, table, ir.Constant(I64, i * W)) for i in range(4))
-        a_end, b_end, low = _splat(builder, a_end), _splat(builder, b_end), ir.Constant(VF, [-1.0] * W)
+        a_end, b_end = _splat(builder, a_end), _splat(builder, b_end)
         total = cgutils.alloca_once_value(builder, ir.Constant(VF, [0.0] * W))
         with cgutils.for_range_slice(builder, k_0, k_1, ir.Constant(I64, 1), I64) as (k, _number):
             step = _splat(builder, builder.fsub(builder.sitofp(k, F32), centre))
-
-            def held(position: Any, slope: Any, end: Any, step: Any = step) -> Any:
-                place = _call(builder, "fma", step, slope, position)
-                place = builder.select(builder.fcmp_ordered(">", place, low), place, low)
-                return builder.select(builder.fcmp_ordered("<", place, end), place, end)
-
+            at_a = _held(builder, _call(builder, "fma", step, da, a), a_end)
+            at_b = _held(builder, _call(builder, "fma", step, db, b), b_end)
             start = builder.add(base, builder.mul(k, plane))
-            value = _bilinear(builder, voxels, count, start, row, held(a, da, a_end), held(b, db, b_end))
+            value = _bilinear(builder, voxels, count, start, row, at_a, at_b)
             builder.store(builder.fadd(builder.load(total, typ=VF), value), total)
-        builder.store(builder.load(total, typ=VF), _at(builder, target, at, VF), align=4)
+        builder.store(builder.load(total, typ=VF), _at(builder, target, ir.Constant(I64, 0), VF), align=4)
         return context.get_dummy_value()
 
     return signature, generate

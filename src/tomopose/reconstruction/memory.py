@@ -7,7 +7,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from tomopose.engines.kernels import MARGIN
+from tomopose.engines.layout import MARGIN
 from tomopose.errors import InputError
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.volume import VoxelGrid
