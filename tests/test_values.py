@@ -155,7 +155,7 @@ def test_a_folder_is_written_whole_or_not_at_all(tmp_path):
             (folder / "c.txt").write_text("3")
             (folder / "a.txt").write_text("new")
 
-    with pytest.raises(FileError, match="--force"):
+    with pytest.raises(FileError, match="force=True"):
         again()
     assert (out / "a.txt").read_text() == "1"
     assert not (out / "c.txt").exists()

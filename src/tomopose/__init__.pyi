@@ -91,9 +91,9 @@ from .io.foreign.reading import read_pose_log as read_pose_log
 from .io.foreign.reading import read_scanner_draft as read_scanner_draft
 from .io.foreign.scanner_draft import ScannerDraft as ScannerDraft
 from .io.images.correction import FlatField as FlatField
+from .io.images.formats.raw import RawLayout as RawLayout
 from .io.images.frames import FrameSource as FrameSource
 from .io.images.opening import open_images as open_images
-from .io.images.raw import RawLayout as RawLayout
 from .io.images.sequence import ImageSequence as ImageSequence
 from .io.images.writing import write_hdf5 as write_hdf5
 from .io.images.writing import write_tiff as write_tiff

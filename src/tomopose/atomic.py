@@ -41,7 +41,7 @@ def require_absent(path: str | Path, *, force: bool = False) -> Path:
         raise FileError(f"{path} is a link to nothing; remove it or give another name", path=path)
     _require_file_or_folder(path)
     if there and not force:
-        raise FileError(f"{path} exists already; give another name or --force to overwrite it", path=path)
+        raise FileError(f"{path} exists already; give another name, or force=True to overwrite it", path=path)
     return path
 
 

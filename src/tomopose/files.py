@@ -49,7 +49,7 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     )
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """A value as JSON knows it: arrays become lists, numbers that are not finite become null."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
@@ -70,7 +70,7 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
-def write_json(path: str | Path, name: str, content: Mapping[str, Any], *, version: int = 1) -> None:
+def write_json(path: str | Path, name: str, content: Mapping[str, object], *, version: int = 1) -> None:
     """JSON of schema `tomopose/NAME/VERSION`, atomically, floats with all their digits."""
     document = {"schema": f"tomopose/{name}/{version}", **plain(content)}
     if name in SEALED:
@@ -99,12 +99,12 @@ def _digest(document: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def was_edited(document: Mapping[str, Any]) -> bool:
+def was_edited(document: Mapping[str, object]) -> bool:
     """Whether a result's content is another than it was written with; False where it holds no digest (schema 1)."""
     return DIGEST in document and document[DIGEST] != _digest(document)
 
 
-def warn_if_edited(document: Mapping[str, Any], path: str | Path) -> None:
+def warn_if_edited(document: Mapping[str, object], path: str | Path) -> None:
     """EditedWarning, by name, where a result was changed after it was written."""
     if was_edited(document):
         warn_edited(path)

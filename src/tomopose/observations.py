@@ -139,7 +139,7 @@ class BallObservations(Rows):
         """(n, 2) standard uncertainties of u and v, px."""
         return np.sqrt(np.einsum("nii->ni", self.covariance))
 
-    def select(self, index: Any) -> BallObservations:
+    def select(self, index: object) -> BallObservations:
         """The rows with those indices (or that mask or slice), in that order."""
         i = rows_at(len(self), index)
 

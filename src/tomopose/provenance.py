@@ -72,7 +72,7 @@ def sha256(path: str | Path) -> str:
 
 
 def provenance(
-    *, inputs: Iterable[str | Path] = (), arguments: Mapping[str, Any] | None = None, seed: int | None = None
+    *, inputs: Iterable[str | Path] = (), arguments: Mapping[str, object] | None = None, seed: int | None = None
 ) -> Provenance:
     """The provenance of a result made now.  Inputs are named without their folders."""
     return Provenance(

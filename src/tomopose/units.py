@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +41,6 @@ def value_with_uncertainty(value: float, u: float, unit: str = "") -> str:
     return f"{value:.{-last}f}({scaled}){tail}"
 
 
-def rows_at(n: int, index: Any) -> np.ndarray:
+def rows_at(n: int, index: object) -> np.ndarray:
     """Row numbers (m,) out of 0 .. n - 1 that a mask, a slice or a list of indices means."""
     return np.arange(n)[index if isinstance(index, slice) else np.asarray(index)]

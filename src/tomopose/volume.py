@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError, ShapeError
+from tomopose.geometry.box import BOX_CORNERS
 from tomopose.provenance import Provenance
 from tomopose.units import Array, float_array
 from tomopose.values import value
@@ -70,8 +71,7 @@ class VoxelGrid:
     def corners(self) -> Array:
         """The eight outer corners of the grid's box (8, 3), mm in W: half a voxel beyond the outermost centres."""
         half = self.spacing * np.array(self.n_xyz) / 2
-        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
-        return self.centre + signs * half
+        return self.centre + BOX_CORNERS * half
 
     @property
     def index_to_W(self) -> Array:

@@ -312,3 +312,22 @@ def test_exchanged_pixel_pitches() -> None:
         detect_image(image, exchanged, ball_diameter=2 * scene.radius)
     with pytest.raises(InputError, match=r"p_u = 0\.26 mm and p_v = 0\.2 mm are exchanged"):
         detect([image], exchanged, ball_diameter=2 * scene.radius)
+
+
+def test_an_error_of_our_own_inside_the_fit_is_never_called_a_bad_image(
+    scene: Scene, good: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*args: object, **options: object) -> BallImage:
+        raise ValueError("operands could not be broadcast together with shapes (3,) (4,)")
+
+    monkeypatch.setattr("tomopose.detection.run.rows.detect_image", broken)
+    with pytest.raises(ValueError, match="broadcast") as caught:
+        detect([good, good], scene.scanner, ball_diameter=8.0)
+    assert not isinstance(caught.value, InputError)
+
+
+def test_an_image_that_cannot_be_read_is_a_bad_image(scene: Scene, good: np.ndarray) -> None:
+    """Rows of different lengths are no array."""
+    found = detect([good, [[1, 2], [3]]], scene.scanner, ball_diameter=8.0)
+    assert found.seen.tolist() == [True, False]
+    assert found.status[1].startswith("bad image: ")

@@ -10,7 +10,7 @@ import tifffile
 
 import tomopose as tp
 from tomopose.errors import ConventionError, InputError, InputWarning
-from tomopose.io.images.tiff import date_time
+from tomopose.io.images.formats.tiff import date_time
 
 PICTURE = np.arange(35, dtype=np.uint16).reshape(5, 7)
 STORED = {

@@ -13,7 +13,7 @@ import tifffile
 
 from tomopose import open_images, read_scanner
 from tomopose.errors import FileError, InputError, TomoposeError
-from tomopose.io.images.tiff_structure import require_sound_tiff
+from tomopose.io.images.formats.tiff_structure import require_sound_tiff
 from tomopose.reading import memory, parse_json, parse_toml, read_text, reader, reading, require_inside
 from tomopose.reading.arrays import read_npy, read_npz
 from tomopose.reading.border import in_words

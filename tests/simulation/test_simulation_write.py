@@ -154,7 +154,7 @@ def test_the_other_format_leaves_nothing_of_the_first(run, tmp_path):
 def test_radiographs_of_unknown_origin_are_not_removed(run, tmp_path):
     (tmp_path / "radiographs").mkdir()
     (tmp_path / "radiographs/pose_0000.tif").write_bytes(b"a measured image")
-    with pytest.raises(FileError, match="--force"):
+    with pytest.raises(FileError, match="force=True"):
         write_run(tmp_path, run, resume=True)
     assert (tmp_path / "radiographs/pose_0000.tif").read_bytes() == b"a measured image"
     with pytest.warns(StartsAnewWarning, match="no readable key"):

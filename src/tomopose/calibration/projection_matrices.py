@@ -18,6 +18,7 @@ from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.error_models import corrected_poses
 from tomopose.manipulator.poses import PIVOT_TOLERANCE_MM, PoseSequence
 from tomopose.units import Array
+from tomopose.values import require_types
 
 SCANNER_TOLERANCE = 1e-9
 STILL_MM, STILL_RAD = 1e-6, 1e-9
@@ -77,6 +78,7 @@ def _point_sigma(
     return np.sqrt(shared**2 + own), shared
 
 
+@require_types
 def projection_matrices(
     calibration: Calibration,
     poses: PoseSequence,

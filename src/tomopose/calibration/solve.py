@@ -43,6 +43,7 @@ from tomopose.manipulator.real_poses import Repeatability
 from tomopose.observations import BallObservations
 from tomopose.provenance import provenance
 from tomopose.units import Array
+from tomopose.values import require_types
 
 MODELS = ("auto", "rigid", "kinematic", "slack")
 
@@ -76,7 +77,7 @@ def _rigid(
     stated: Solution,
     diagnosis: Diagnosis | None,
     arrangement: Arrangement,
-    arguments: Mapping[str, Any],
+    arguments: Mapping[str, object],
     taken: Taken,
 ) -> Calibration:
     p, fit, free = solution.used, solution.fit, solution.free
@@ -185,6 +186,7 @@ def _unseen(solution: Solution, linear: LinearFit, *, moving_scanner: bool) -> U
     )
 
 
+@require_types
 def calibrate(
     scanner: Scanner | Sequence[Scanner],
     poses: PoseSequence | Sequence[PoseSequence],

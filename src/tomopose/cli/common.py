@@ -73,7 +73,7 @@ def tell(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
-def as_line(document: Mapping[str, Any]) -> str:
+def as_line(document: Mapping[str, object]) -> str:
     """JSON in one line, in characters that standard output has."""
     unicode = (sys.stdout.encoding or "").lower().replace("-", "").startswith("utf")
     return json.dumps(document, ensure_ascii=not unicode, allow_nan=False)
@@ -90,7 +90,7 @@ class Say:
         if not self.quiet and not self.json:
             tell(text)
 
-    def result(self, summary: Mapping[str, Any], lines: Sequence[str] = ()) -> None:
+    def result(self, summary: Mapping[str, object], lines: Sequence[str] = ()) -> None:
         """The summary as JSON, or its lines for people."""
         from tomopose.files import plain
 
@@ -172,7 +172,7 @@ def names(text: str | None) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip()) if text else ()
 
 
-def arguments(**values: Any) -> dict[str, Any]:
+def arguments(**values: object) -> dict[str, Any]:
     """The arguments of a verb for the provenance: paths by their names alone, and the project's facts for reports."""
     from tomopose.cli.project import current_facts
 

@@ -164,7 +164,7 @@ def relative(path: Path, folder: Path) -> str:
         return str(path.absolute())
 
 
-def ask(values: dict[str, Any], facts: dict[str, str]) -> None:
+def ask(values: dict[str, object], facts: dict[str, str]) -> None:
     """Ask on the terminal for what is not known; an empty answer leaves it out."""
     for key, question in (
         ("scanner", "scanner.json"),

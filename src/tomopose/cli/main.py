@@ -105,7 +105,7 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: object, *
 
 
 def _fail(error: BaseException, code: int, *, as_json: bool) -> int:
-    message = " ".join(str(error).split()) or type(error).__name__
+    message = " ".join(str(error).split()).replace("force=True", "--force") or type(error).__name__
     if isinstance(error, EngineMissingError) and error.install_line and error.install_line not in message:
         message += f"; install it with: {error.install_line}"
     if as_json:

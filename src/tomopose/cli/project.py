@@ -183,7 +183,7 @@ def read_project(path: Path) -> Project:
     return Project(path=path, values=values, facts=facts)
 
 
-def _checked(path: Path, key: str, value: Any) -> Any:
+def _checked(path: Path, key: str, value: object) -> Any:
     if key in NUMBERS:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise InputError(f"{path}: {key} is {value!r}; a number is needed")
@@ -193,7 +193,7 @@ def _checked(path: Path, key: str, value: Any) -> Any:
     return value
 
 
-def project_text(values: Mapping[str, Any], facts: Mapping[str, str]) -> str:
+def project_text(values: Mapping[str, object], facts: Mapping[str, str]) -> str:
     """The text of a project file: what is known, and what else may be said, as remarks."""
     lines = [
         "# What every tomopose verb takes where its options do not say it; file names are relative to this file.",

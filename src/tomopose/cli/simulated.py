@@ -147,7 +147,7 @@ def clear_another_run(out: Path, key: Key, *, force: bool) -> None:
     if kept is None and not force:
         raise FileError(
             f"{out} holds radiographs, but no truth.json says which simulated run they belong to; give another folder, "
-            "or --force to replace them",
+            "or force=True to replace them",
             path=out,
         )
     if same_key(kept, key, what=f"the simulated run in {out}"):

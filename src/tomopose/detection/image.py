@@ -31,6 +31,7 @@ from tomopose.errors import AmbiguousBallError, BallNotFoundError, BallTruncated
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.silhouette import silhouette_ellipse
 from tomopose.units import Array
+from tomopose.values import require_types
 
 ALIKE = math.log(1.2)
 """Ratio of two diameters, as a logarithm, below which size does not distinguish the balls: magnification varies by 10 %
@@ -40,6 +41,7 @@ WIDTHS_ABOUT = 14.0
 takes a wide blur for a smaller ball, leaves out of both."""
 
 
+@require_types
 def detect_image(
     image: Image,
     scanner: Scanner,
@@ -70,7 +72,6 @@ def detect_image(
     InputError, ShapeError   not a valid image, or one of another size than the scanner's detector.
     BallNotFoundError, BallTruncatedError, AmbiguousBallError, DetectionError   no measurement, with the reason.
     """
-    require_types(scanner, settings)
     expected = expected_radius(scanner, checked_diameter(ball_diameter))
     others = [expected_radius(scanner, checked_diameter(d)) for d in other_diameters]
     if predicted is None and any(abs(math.log(r / expected)) < ALIKE for r in others):
@@ -109,15 +110,6 @@ def checked_diameter(ball_diameter: float) -> float:
     if not (math.isfinite(ball_diameter) and ball_diameter > 0):
         raise InputError(f"ball_diameter is {ball_diameter!r} mm; a positive number is needed")
     return float(ball_diameter)
-
-
-def require_types(scanner: Scanner, settings: DetectionSettings) -> None:
-    """InputError that names an argument of another type."""
-    if not isinstance(scanner, Scanner):
-        hint = ": read_scanner(path) reads it" if isinstance(scanner, str) else ""
-        raise InputError(f"scanner must be a Scanner; a {type(scanner).__name__} was given{hint}")
-    if not isinstance(settings, DetectionSettings):
-        raise InputError(f"settings must be DetectionSettings; a {type(settings).__name__} was given")
 
 
 def _whole_numbers(origin: tuple[int, int]) -> tuple[int, int]:

@@ -11,11 +11,6 @@ import math
 import numpy as np
 from numba import njit
 
-MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a normal variable over its median absolute deviation: 1 / Phi^-1(3/4)."""
-NORMAL_MEDIAN = 0.455
-"""Median of the square of a standard normal variable: Phi^-1(3/4)^2."""
-
 
 @njit(cache=True)
 def select(values, k):  # type: ignore[no-untyped-def]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
 
 from tomopose.engines.protocol import Availability, Engine
 from tomopose.errors import EngineMissingError, InputError
@@ -23,7 +22,7 @@ def available_engines() -> tuple[Availability, ...]:
     return tuple(import_module(module).availability() for module, _ in ENGINES.values())
 
 
-def make_engine(name: str, matrices: ProjectionMatrices, grid: VoxelGrid, **options: Any) -> Engine:
+def make_engine(name: str, matrices: ProjectionMatrices, grid: VoxelGrid, **options: object) -> Engine:
     """The engine of that name for one scan and one grid; "auto" is the GPU where there is one, else the CPU.
 
     Raises InputError for an unknown name, EngineMissingError where the engine cannot run here.

@@ -19,6 +19,7 @@ from tomopose.exports import leap as leap_format
 from tomopose.exports import tigre as tigre_format
 from tomopose.exports.panel import Rows, check_rows, unmirrored_panels
 from tomopose.geometry.projection import ProjectionMatrices
+from tomopose.values import require_types
 
 INSTALL = {
     "astra": "pip install 'tomopose[gpu]'",
@@ -38,6 +39,7 @@ def _module(name: str, package: str) -> Any:
         ) from error
 
 
+@require_types
 def to_astra(matrices: ProjectionMatrices, *, rows: Rows = "bottom") -> dict[str, Any]:
     """ASTRA's projection geometry `cone_vec`, for data (rows, views, columns) with that row order.
 
@@ -49,6 +51,7 @@ def to_astra(matrices: ProjectionMatrices, *, rows: Rows = "bottom") -> dict[str
     return dict(package.create_proj_geom("cone_vec", int(matrices.n_v), int(matrices.n_u), vectors))
 
 
+@require_types
 def to_rtk(matrices: ProjectionMatrices) -> Any:
     """RTK's ThreeDCircularProjectionGeometry, world axes (y, z, x) of W.
 
@@ -62,6 +65,7 @@ def to_rtk(matrices: ProjectionMatrices) -> Any:
     return rtk_geometry(matrices, range(len(matrices)))
 
 
+@require_types
 def to_cil(matrices: ProjectionMatrices, *, rows: Rows = "bottom") -> Any:
     """CIL's AcquisitionGeometry (Cone3D_Flex, 25.0 and later), labels (projection, vertical, horizontal)."""
     check_rows(rows)
@@ -75,6 +79,7 @@ def to_cil(matrices: ProjectionMatrices, *, rows: Rows = "bottom") -> Any:
     return geometry
 
 
+@require_types
 def to_tigre(matrices: ProjectionMatrices) -> tuple[Any, Any]:
     """TIGRE's geometry and the angles (n, 3) that go with it; projections [angle, v, u], row 0 at the bottom.
 
@@ -90,6 +95,7 @@ def to_tigre(matrices: ProjectionMatrices) -> tuple[Any, Any]:
     return geometry, angles
 
 
+@require_types
 def to_leap(matrices: ProjectionMatrices, *, rows: Rows = "bottom") -> Any:
     """LEAP's model with a modular beam, for projections (n, rows, columns) with that row order.
 

@@ -100,7 +100,7 @@ def require_images(images: Any, views: Sequence[int], matrices: ProjectionMatric
     return images
 
 
-def require_support(support: Any, grid: VoxelGrid) -> np.ndarray | None:
+def require_support(support: object, grid: VoxelGrid) -> np.ndarray | None:
     """The support mask as bool [z, y, x]."""
     if support is None:
         return None

@@ -6,9 +6,8 @@ The centre is the middle of the panel; U and V are the steps from pixel to pixel
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.exports.panel import Given, Rows, matrices_of_panels, numbers, panels
 from tomopose.geometry.projection import ProjectionMatrices
@@ -24,7 +23,7 @@ def to_astra(matrices: ProjectionMatrices, *, rows: Rows = "bottom") -> Array:
     return np.hstack([g.source, g.centre, g.U, -g.V if rows == "top" else g.V])
 
 
-def from_astra(vectors: Any, given: Given, *, where: str = "the ASTRA vectors") -> ProjectionMatrices:
+def from_astra(vectors: ArrayLike, given: Given, *, where: str = "the ASTRA vectors") -> ProjectionMatrices:
     """Matrices of vectors (n, 12).  They do not hold n_u, n_v and the row order they were made for: `given` must."""
     table = numbers(vectors, (-1, 12), where)
     rows = given.settle("rows", None, where)

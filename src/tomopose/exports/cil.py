@@ -33,7 +33,7 @@ def to_cil(matrices: ProjectionMatrices, *, rows: Rows = "bottom") -> dict[str, 
     }
 
 
-def from_cil(content: Mapping[str, Any], given: Given, *, where: str = "the CIL arrays") -> ProjectionMatrices:
+def from_cil(content: Mapping[str, object], given: Given, *, where: str = "the CIL arrays") -> ProjectionMatrices:
     """Matrices of `to_cil`'s arrays.  The row order has no part in them: direction_y points up either way."""
     require_keys(content, KEYS, where)
     if str(content["origin"]) not in ORIGINS.values():

@@ -26,6 +26,7 @@ from tomopose.exports.tigre import to_tigre
 from tomopose.files import atomic_folder, plain, read_json, write_json
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.provenance import Provenance, provenance, sha256
+from tomopose.values import require_types
 
 MANIFEST = "manifest.json"
 ABOUT = (
@@ -49,7 +50,7 @@ class Format:
     rows_note: str = ""
 
 
-def _npz(name: str, arrays: Mapping[str, Any]) -> Callable[[Path], Sequence[str]]:
+def _npz(name: str, arrays: Mapping[str, object]) -> Callable[[Path], Sequence[str]]:
     def write(folder: Path) -> Sequence[str]:
         np.savez(folder / name, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
         return (name,)
@@ -57,7 +58,7 @@ def _npz(name: str, arrays: Mapping[str, Any]) -> Callable[[Path], Sequence[str]
     return write
 
 
-def _json_text(content: Mapping[str, Any]) -> str:
+def _json_text(content: Mapping[str, object]) -> str:
     return json.dumps(plain(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
@@ -181,6 +182,7 @@ class Exported:
     provenance: Provenance
 
 
+@require_types
 def export(
     matrices: ProjectionMatrices,
     out: Path | str,

@@ -64,7 +64,7 @@ def _keyed(format: str, key: str, read: Callable[..., ProjectionMatrices]) -> Re
     return Reader(recognise=lambda c: isinstance(c, Mapping) and key in c, read=reading)
 
 
-def _is_astra(content: Any) -> bool:
+def _is_astra(content: object) -> bool:
     return isinstance(content, np.ndarray) and content.ndim == 2 and content.shape[1] == 12
 
 
@@ -97,7 +97,7 @@ def _read_rtk(source: Source, given: Given) -> ProjectionMatrices:
     return matrices
 
 
-def _is_cera(content: Any) -> bool:
+def _is_cera(content: object) -> bool:
     if not isinstance(content, str):
         return False
     return is_cera_table(content) or content.startswith("#CERACONFIG") or "ProjectionMatrixFilename" in content
@@ -139,7 +139,7 @@ def _read_robot_json(source: Source, given: Given) -> ProjectionMatrices:
     return from_robot_json(content, given, where=str(source.path))
 
 
-def _is_ctsimu(content: Any) -> bool:
+def _is_ctsimu(content: object) -> bool:
     file = content.get("file") if isinstance(content, Mapping) else None
     return isinstance(file, Mapping) and file.get("file_type") == "CTSimU Scenario"
 
@@ -172,7 +172,7 @@ READERS: Mapping[str, Reader] = {
 """Format -> reader, most specific first."""
 
 
-def format_of(content: Any) -> str | None:
+def format_of(content: object) -> str | None:
     """The format of a content; None where none is certain."""
     found = [name for name, reader in READERS.items() if reader.recognise(content)]
     keyed = [name for name in found if name in ("leap", "tigre", "cil", "pyronn")]

@@ -33,7 +33,7 @@ def to_leap(matrices: ProjectionMatrices, *, rows: Rows = "bottom") -> dict[str,
     }
 
 
-def from_leap(content: Mapping[str, Any], given: Given, *, where: str = "the LEAP arrays") -> ProjectionMatrices:
+def from_leap(content: Mapping[str, object], given: Given, *, where: str = "the LEAP arrays") -> ProjectionMatrices:
     """Matrices of `to_leap`'s arrays; `given` must hold n_u, n_v and the row order."""
     require_keys(content, KEYS, where)
     vectors = {k: numbers(content[k], (-1, 3), f"{where}: {k}") for k in KEYS[:4]}

@@ -90,7 +90,7 @@ def _bounding_box(m: ProjectionMatrices) -> dict[str, Any]:
     return {"centerXYZ": [0.0, 0.0, 0.0], "sizeXYZ": [side, side, side]}
 
 
-def from_openct(content: Mapping[str, Any], given: Given, *, where: str = "the openCT file") -> ProjectionMatrices:
+def from_openct(content: Mapping[str, object], given: Given, *, where: str = "the openCT file") -> ProjectionMatrices:
     """Matrices of an openCT JSON content.  Its detector frame says how rows count; the images' order has no part.
 
     A circular scan may state distances and its total angle instead.  Raises InputError where it has neither, or mirrors
@@ -134,9 +134,9 @@ def from_openct(content: Mapping[str, Any], given: Given, *, where: str = "the o
 
 
 def _circular(
-    head: Mapping[str, Any],
-    projections: Mapping[str, Any],
-    geometry: Mapping[str, Any],
+    head: Mapping[str, object],
+    projections: Mapping[str, object],
+    geometry: Mapping[str, object],
     given: Given,
     where: str,
 ) -> ProjectionMatrices:
@@ -154,7 +154,7 @@ def _circular(
             f"{where}: skipAngle is {geometry['skipAngle']!r}; whether it turns the first view is not documented"
         )
 
-    def number(section: Mapping[str, Any], name: str) -> float:
+    def number(section: Mapping[str, object], name: str) -> float:
         if section.get(name) is None:
             raise InputError(f"{where}: a circular scan needs {name}, which is missing")
         return float(numbers(section[name], (), f"{where}: {name}"))
@@ -180,7 +180,7 @@ def _circular(
     )
 
 
-def _part(content: Mapping[str, Any], name: str, where: str, *, needed: bool = True) -> Mapping[str, Any]:
+def _part(content: Mapping[str, object], name: str, where: str, *, needed: bool = True) -> Mapping[str, Any]:
     part = content.get(name)
     if part is None and not needed:
         return {}

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import ConventionError, InputError, NotRepresentableError, ShapeError
 from tomopose.geometry.projection import ProjectionMatrices, ViewGeometry, compose
@@ -56,7 +57,7 @@ class Given:
         """The same with some values settled."""
         return replace(self, **values)
 
-    def settle(self, name: str, found: Any, where: str) -> Any:
+    def settle(self, name: str, found: object, where: str) -> Any:
         """The value of n_u, n_v, p_u, p_v or rows from the file (`found`, or None) and from the caller.
 
         InputError where the two contradict, or where neither has it: nothing is guessed.
@@ -130,7 +131,7 @@ def unmirrored_panels(matrices: ProjectionMatrices, format: str) -> ViewGeometry
 
 
 def matrices_of_panels(
-    source: Any, centre: Any, U: Any, V: Any, *, given: Given, rows: Rows, where: str
+    source: ArrayLike, centre: ArrayLike, U: ArrayLike, V: ArrayLike, *, given: Given, rows: Rows, where: str
 ) -> ProjectionMatrices:
     """Matrices of sources, panel centres and steps (each (n, 3), mm) per column and per array row.
 
@@ -175,7 +176,7 @@ def require_keys(content: Any, keys: Sequence[str], where: str) -> None:
         raise InputError(f"{where} lacks {', '.join(missing)}; it holds {', '.join(map(str, content)) or 'nothing'}")
 
 
-def numbers(values: Any, shape: tuple[int, ...], where: str) -> Array:
+def numbers(values: object, shape: tuple[int, ...], where: str) -> Array:
     """A float64 array of that shape (-1: any length) with finite values only; InputError says what was found."""
     try:
         array = np.array(values, dtype=np.float64)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,7 @@ below.
 """
 
 
-def matrices_in(content: Any) -> Array | None:
+def matrices_in(content: object) -> Array | None:
     """(n, 3, 4) of an array, of the one such array in a mapping, or of a text with twelve numbers a row; else None."""
     if isinstance(content, np.ndarray):
         return _as_matrices(content)
@@ -63,7 +62,7 @@ def _of_text(text: str) -> Array | None:
     return None
 
 
-def from_matrices(content: Any, given: Given, *, where: str = "the matrices") -> ProjectionMatrices:
+def from_matrices(content: object, given: Given, *, where: str = "the matrices") -> ProjectionMatrices:
     """Matrices of bare numbers; `given` must hold size, pitch and row order."""
     found = matrices_in(content)
     if found is None:

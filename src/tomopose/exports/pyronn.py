@@ -7,7 +7,6 @@ are part of the format.  Arrays whose row 0 is the top take F P.  Source: PYRO-N
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from tomopose.exports.panel import Given, Rows, numbers, require_keys
 from tomopose.geometry.projection import ProjectionMatrices, row_flip
@@ -19,7 +18,9 @@ def to_pyronn(matrices: ProjectionMatrices, *, rows: Rows = "bottom") -> dict[st
     return {"projection_matrices": matrices.top_first() if rows == "top" else matrices.P}
 
 
-def from_pyronn(content: Mapping[str, Any], given: Given, *, where: str = "the PYRO-NN arrays") -> ProjectionMatrices:
+def from_pyronn(
+    content: Mapping[str, object], given: Given, *, where: str = "the PYRO-NN arrays"
+) -> ProjectionMatrices:
     """Matrices of `to_pyronn`'s array; `given` must hold size, pitch and row order."""
     require_keys(content, ("projection_matrices",), where)
     P = numbers(content["projection_matrices"], (-1, 3, 4), f"{where}: projection_matrices")

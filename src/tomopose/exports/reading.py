@@ -107,7 +107,7 @@ def read_geometry(
     return matrices
 
 
-def _name(content: Any, format: str | None, path: Path) -> str:
+def _name(content: object, format: str | None, path: Path) -> str:
     """The format's name; ConventionError where the file is of another one than the caller says."""
     found = format_of(content)
     if format is None:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from tomopose.errors import InputError
 from tomopose.exports.panel import Given, matrices_of_panels, numbers, unmirrored_panels
+from tomopose.geometry.box import BOX_CORNERS
 from tomopose.geometry.projection import ProjectionMatrices, compose
 from tomopose.units import Array
 
@@ -54,7 +55,7 @@ class RobotPanel:
         return (self.n_v - 1) / 2 + float(self.v @ (self.source - self.centre)) / self.p_v
 
 
-def is_robot_json(content: Any) -> bool:
+def is_robot_json(content: object) -> bool:
     """Whether a JSON content is a view of a robot scanner, or a list of them."""
     if isinstance(content, list):
         return bool(content) and is_robot_json(content[0])
@@ -62,13 +63,13 @@ def is_robot_json(content: Any) -> bool:
     return isinstance(geometry, Mapping) and "focal_spot_position_mm" in geometry
 
 
-def panel_of(view: Mapping[str, Any], where: str) -> RobotPanel:
+def panel_of(view: Mapping[str, object], where: str) -> RobotPanel:
     """Source and panel of one view; InputError names what is missing or no number."""
     geometry, detector = view.get("projection_geometry"), view.get("detector")
     if not isinstance(geometry, Mapping) or not isinstance(detector, Mapping):
         raise InputError(f"{where} ({MAKER}) lacks the section projection_geometry or detector")
 
-    def entry(section: Mapping[str, Any], shape: tuple[int, ...], *names: str) -> Any:
+    def entry(section: Mapping[str, object], shape: tuple[int, ...], *names: str) -> Any:
         for name in names:
             if section.get(name) is not None:
                 return numbers(section[name], shape, f"{where}: {name}")
@@ -93,7 +94,7 @@ def panel_of(view: Mapping[str, Any], where: str) -> RobotPanel:
 
 
 def from_robot_json(
-    content: Mapping[str, Any] | Sequence[Mapping[str, Any]], given: Given, *, where: str = MAKER
+    content: Mapping[str, object] | Sequence[Mapping[str, object]], given: Given, *, where: str = MAKER
 ) -> ProjectionMatrices:
     """Matrices of one view or of a list of views.  v counts up the panel; the image files' order has no part.
 
@@ -140,7 +141,7 @@ def _compare(view: Mapping[str, Any], panel: RobotPanel, where: str) -> None:
     )[0]
     middle = (panel.source + panel.centre) / 2
     reach = np.linalg.norm(panel.centre - panel.source) / 10
-    x = middle + reach * np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)])
+    x = middle + reach * BOX_CORNERS
     with np.errstate(all="ignore"):  # a matrix of nonsense gives NaN, which the test below refuses
         a, b = (h[:, :2] / h[:, 2:] for h in (np.c_[x, np.ones(8)] @ m.T for m in (P, stored)))
     if not np.abs(a - b).max() < CROSS_CHECK_TOLERANCE_PX:

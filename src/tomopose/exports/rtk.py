@@ -24,6 +24,7 @@ import numpy as np
 from tomopose.errors import ConventionError, InputError, InputWarning, SchemaVersionError
 from tomopose.exports.euler import zxy_angles
 from tomopose.exports.panel import OPTIONS, Given, numbers, unmirrored_panels
+from tomopose.geometry.box import BOX_CORNERS
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.geometry.rotations import R_x, R_y, R_z
 from tomopose.units import Array, float_array
@@ -80,7 +81,7 @@ def to_rtk(matrices: ProjectionMatrices) -> tuple[str, dict[str, Any]]:
 
 
 def from_rtk(
-    text: str, side: Mapping[str, Any] | None, given: Given, *, where: str = "the RTK geometry"
+    text: str, side: Mapping[str, object] | None, given: Given, *, where: str = "the RTK geometry"
 ) -> ProjectionMatrices:
     """Matrices of an RTK XML text and its side data (`origin`, `spacing`, optional `world_to_rtk`,
     `direction`, `size`).  Without side data, size and pitch must be given, and the panel is centred.
@@ -125,7 +126,7 @@ def _centred(given: Given, where: str) -> dict[str, Any]:
     return {"origin": [-(n_u - 1) / 2 * p_u, -(n_v - 1) / 2 * p_v], "spacing": [p_u, p_v]}
 
 
-def matrix_of_parameters(p: Mapping[str, Any]) -> Array:
+def matrix_of_parameters(p: Mapping[str, object]) -> Array:
     """RTK's matrix (n, 3, 4) or (3, 4), RTK axes to detector mm, of the nine parameters (mm, degrees)."""
     v = {name: np.asarray(p[name], dtype=np.float64) for name in PARAMETERS}
     gantry, in_plane, out_of_plane = (np.radians(v[f"{name}Angle"]) for name in ("Gantry", "InPlane", "OutOfPlane"))
@@ -252,7 +253,7 @@ def _view(k: int, view: Mapping[str, Any], to_px: Array, where: str) -> Array:
     if stored is None:
         return M
     reach = view["SourceToIsocenterDistance"] / 4
-    points = reach * np.array([[x, y, z, 1 / reach] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    points = np.c_[reach * BOX_CORNERS, np.ones(8)]
     with np.errstate(all="ignore"):  # a matrix of nonsense gives NaN, which the test below refuses
         a, b = (h[:, :2] / h[:, 2:] for h in (points @ (to_px @ m).T for m in (M, stored)))
         difference = np.abs(a - b).max()

@@ -28,11 +28,13 @@ from tomopose.io.scanner_json import scanner_document, scanner_from_document
 from tomopose.provenance import Provenance
 from tomopose.reading import reader
 from tomopose.reading.contradictions import require_consistent_calibration
+from tomopose.values import require_types
 
 VERSION = 2
 ANGLES_TOLERANCE = 1e-9
 
 
+@require_types
 def write_calibration(path: str | Path, cal: Calibration, *, force: bool = False) -> None:
     """Write calibration.json; `read_calibration` gives back every number bit for bit.
 
@@ -215,11 +217,11 @@ def _calibration(document: Mapping[str, Any], where: str) -> Calibration:
     return result
 
 
-def _number(value: Any) -> float:
+def _number(value: object) -> float:
     return float(decode_array(value))
 
 
-def _T_HT(block: Mapping[str, Any], where: str) -> RigidTransform:
+def _T_HT(block: Mapping[str, object], where: str) -> RigidTransform:
     T_HT = RigidTransform.from_matrix(decode_array(block["matrix"], 4, 4), source=Frame.H, target=Frame.T)
     angles, t = decode_array(block["angles_rad"], 3), decode_array(block["t_mm"], 3)
     off = float(rotation_angle_between(rotation_from_angles(angles), T_HT.R))

@@ -19,12 +19,14 @@ from tomopose.provenance import Provenance
 from tomopose.reading import parse_json, reader
 from tomopose.reading.arrays import read_npz
 from tomopose.reading.contradictions import require_one_handedness, require_same, require_unique, require_whole
+from tomopose.values import require_types
 
 REQUIRED = ("P", "n_u", "n_v", "p_u", "p_v", "pose_id")
 SIGMA = {"P_points_sigma_px": "points_sigma", "P_points_sigma_shared_px": "points_sigma_shared"}
 KNOWN = ("schema", *REQUIRED, *SIGMA, "in_front_mm", "scanner", "provenance", DIGEST)
 
 
+@require_types
 def write_matrices(
     path: str | Path, P: ProjectionMatrices, *, provenance: Provenance | None = None, force: bool = False
 ) -> None:

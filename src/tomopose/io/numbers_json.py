@@ -27,7 +27,7 @@ def decode(value: Any) -> Any:
     return math.nan if value is None else float(value)
 
 
-def decode_array(value: Any, *shape: int) -> Array:
+def decode_array(value: object, *shape: int) -> Array:
     """An array of that shape; ValueError where it has another."""
     array = np.array(decode(value), dtype=np.float64)
     return array.reshape(shape) if array.size == 0 else _exactly(array, shape)

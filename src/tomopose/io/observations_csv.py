@@ -17,6 +17,7 @@ from tomopose.io.table_text import TextTable, format_table, read_table, unknown_
 from tomopose.observations import BallObservations
 from tomopose.reading import reader
 from tomopose.units import Array
+from tomopose.values import require_types
 
 REQUIRED = ("pose_id", "u_px", "v_px", "sigma_u_px", "sigma_v_px")
 NUMBERS = {"snr": "snr", "semi_major": "semi_major_px", "semi_minor": "semi_minor_px", "angle": "angle_rad"}
@@ -135,6 +136,7 @@ def sigma_cell(variance: float) -> str:
     return short if variance_from_cell(short) == variance else str(Context(prec=22).sqrt(Decimal(float(variance))))
 
 
+@require_types
 def write_observations(
     path: str | Path, obs: BallObservations, *, comments: Iterable[tuple[str, str]] = (), force: bool = False
 ) -> None:

@@ -14,6 +14,7 @@ from tomopose.files import natural_key
 from tomopose.io.images.frames import missing_numbers, numbers_in_names
 from tomopose.io.images.sequence import ImageSequence
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.values import require_types
 
 Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
 SHOWN = 5
@@ -21,6 +22,7 @@ TABLE_TOLERANCE_RAD = np.radians(0.1)
 """Turns of the table that differ by more are no positioning error of a rotary table but another column."""
 
 
+@require_types
 def pair_images(poses: PoseSequence, images: ImageSequence | Sequence[str]) -> Indices:
     """For each pose the index (n,) of its image: `images.select(pair_images(poses, images))` is in pose order.
 

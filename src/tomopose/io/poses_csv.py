@@ -30,6 +30,7 @@ from tomopose.io.table_text import TextTable, format_table, read_table, unknown_
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.reading import reader
 from tomopose.units import Array
+from tomopose.values import require_types
 
 POSITION = ("x_mm", "y_mm", "z_mm")
 PLAIN = ("pose_id", "alpha_deg", "image", "ball_id", "time_utc")
@@ -318,6 +319,7 @@ def _warn_if_far(table: TextTable, measured: RigidTransform, commanded: RigidTra
 # -- writing -----------------------------------------------------------------------------------------------------------
 
 
+@require_types
 def write_poses(
     path: str | Path,
     poses: PoseSequence,

@@ -14,6 +14,7 @@ from tomopose.files import read_json, require_absent, write_json
 from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 from tomopose.io.table_text import unknown_column
 from tomopose.reading import reader
+from tomopose.values import require_types
 
 REQUIRED = ("d_SD", "d_SR", "p_u", "p_v", "u_0", "v_0")
 COUNTS = ("n_u", "n_v")
@@ -37,12 +38,13 @@ def read_scanner(path: str | Path) -> Scanner:
     return scanner_from_document(read_json(path, "scanner"), str(path))
 
 
+@require_types
 def write_scanner(path: str | Path, scanner: Scanner, *, force: bool = False) -> None:
     """Write scanner.json.  FileError if the file exists and `force` is not given."""
     write_json(require_absent(path, force=force), "scanner", scanner_document(scanner))
 
 
-def scanner_from_document(document: Mapping[str, Any], where: str) -> Scanner:
+def scanner_from_document(document: Mapping[str, object], where: str) -> Scanner:
     """The scanner in a JSON object; `where` begins the messages."""
     for key in document:
         if key not in KNOWN:
@@ -124,7 +126,7 @@ def _required_keys() -> list[str]:
     return [*(k for k, name in KEYS.items() if name in REQUIRED), *COUNT_KEYS]
 
 
-def _number(value: Any, where: str) -> float:
+def _number(value: object, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(f"{where} is {value!r}; a number is needed")
     try:

@@ -19,17 +19,19 @@ import tifffile
 from tomopose.engines.storage import mapped, pieces, write_layers
 from tomopose.errors import FileError, SchemaVersionError
 from tomopose.files import atomic_file, plain, require_absent
-from tomopose.io.images.tiff_structure import require_sound_tiff
+from tomopose.io.images.formats.tiff_structure import require_sound_tiff
 from tomopose.provenance import Provenance
 from tomopose.reading import parse_json, read_text, reader, require_file, require_inside
 from tomopose.reading.hdf5 import checked_hdf5
 from tomopose.reading.memory import require_memory
+from tomopose.values import require_types
 from tomopose.volume import Volume, VoxelGrid
 
 SCHEMA = "tomopose/volume/1"
 SUFFIXES = (".h5", ".tif", ".tiff", ".nrrd", ".mhd")
 
 
+@require_types
 def write_volume(path: str | Path, volume: Volume, *, force: bool = False) -> Path:
     """Write a volume in the format that the suffix names: .h5, .tif, .tiff, .nrrd or .mhd (with a .raw beside it).
 

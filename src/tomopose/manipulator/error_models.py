@@ -29,6 +29,7 @@ from tomopose.manipulator.run_effects import with_run_effects
 from tomopose.manipulator.serial import SerialRobot
 from tomopose.manipulator.twin import TwinRobots, twin_names
 from tomopose.units import Array, float_array
+from tomopose.values import require_types
 
 RANGE_MARGIN = 0.1
 """Of the calibrated range's width: as far outside a pose still counts as inside."""
@@ -252,11 +253,13 @@ def correction(errors: Errors, poses: PoseSequence) -> PoseCorrection:
     )
 
 
+@require_types
 def corrected_poses(errors: Errors, poses: PoseSequence) -> PoseSequence:
     """The table with T_MH of the real plate in place of the controller's."""
     return correction(errors, poses).poses
 
 
+@require_types
 def commands_for(errors: Errors, wanted: PoseSequence) -> PoseSequence:
     """The table to command so that the real plate reaches the poses `wanted`: the inverse correction.
 

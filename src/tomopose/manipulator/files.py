@@ -174,7 +174,7 @@ def serial_from_document(document: Mapping[str, Any], where: str) -> SerialRobot
     )
 
 
-def _joint(block: Any, where: str, confirmed: bool) -> Joint:
+def _joint(block: object, where: str, confirmed: bool) -> Joint:
     if not isinstance(block, Mapping):
         raise InputError(f"{where} is no object with a_mm, alpha_deg, d_mm, theta_offset_deg")
     require_keys(block, JOINT_KEYS, where, {"a_m", "d_m", "alpha_rad", "theta_offset_rad", "a", "alpha", "d"})
@@ -206,7 +206,7 @@ def _joint(block: Any, where: str, confirmed: bool) -> Joint:
     )
 
 
-def _repeatability(document: Mapping[str, Any], where: str) -> Repeatability:
+def _repeatability(document: Mapping[str, object], where: str) -> Repeatability:
     block = document.get("repeatability")
     if block is None:
         return Repeatability()
@@ -219,7 +219,7 @@ def _repeatability(document: Mapping[str, Any], where: str) -> Repeatability:
     )
 
 
-def _joints(document: Mapping[str, Any], name: str, where: str) -> Array:
+def _joints(document: Mapping[str, object], name: str, where: str) -> Array:
     rows = document.get(name)
     if not isinstance(rows, list):
         raise ShapeError(f"{where}: {name} is needed: six joints of three coordinates, mm")
@@ -234,7 +234,7 @@ def _require_distinct(apart: Array, name: str, where: str) -> None:
         raise InputError(f"{where}: {name}: joints {i + 1} and {j + 1} are the same point; one of them is mistyped")
 
 
-def require_keys(document: Mapping[str, Any], known: Iterable[str], where: str, other_units: set[str]) -> None:
+def require_keys(document: Mapping[str, object], known: Iterable[str], where: str, other_units: set[str]) -> None:
     """InputError for an unknown key, UnitError for one of `other_units`."""
     known = tuple(known)
     for key in document:
@@ -245,7 +245,7 @@ def require_keys(document: Mapping[str, Any], known: Iterable[str], where: str, 
         raise InputError(f"{where}: unknown key {key!r}; known are {', '.join(known)}")
 
 
-def _number(document: Mapping[str, Any], key: str, default: float | None, where: str) -> float:
+def _number(document: Mapping[str, object], key: str, default: float | None, where: str) -> float:
     if key not in document:
         if default is None:
             raise InputError(f"{where}: the key {key!r} is missing")
@@ -253,7 +253,7 @@ def _number(document: Mapping[str, Any], key: str, default: float | None, where:
     return _finite(document[key], key, where)
 
 
-def _finite(value: Any, key: str, where: str) -> float:
+def _finite(value: object, key: str, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
         raise InputError(f"{where}: {key} is {value!r}; a number is needed")
     return float(value)

@@ -22,6 +22,7 @@ from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import ErrorModel, RealPoses, Repeatability
 from tomopose.units import Array
+from tomopose.values import require_types
 
 
 def _inverse(T: RigidTransform) -> RigidTransform:
@@ -29,6 +30,7 @@ def _inverse(T: RigidTransform) -> RigidTransform:
     return RigidTransform(R=inv.R, t=inv.t, source=Frame.M, target=Frame.H)
 
 
+@require_types
 def inverse_poses(poses: PoseSequence) -> PoseSequence:
     """The table for the chain above: T_MH^-1 is in the place of T_MH.  Twice gives the table back.
 

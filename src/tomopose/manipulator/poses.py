@@ -115,7 +115,7 @@ class PoseSequence(Rows):
         positions: ArrayLike,
         orientations: ArrayLike,
         *,
-        pose_id: Sequence[Any] | None = None,
+        pose_id: Sequence[object] | None = None,
         convention: str = "pi-hexapod",
         **columns: Any,
     ) -> PoseSequence:
@@ -136,7 +136,7 @@ class PoseSequence(Rows):
             **columns,
         )
 
-    def select(self, index: Any) -> PoseSequence:
+    def select(self, index: object) -> PoseSequence:
         """The poses with those indices (or that mask or slice), in that order."""
         i = rows_at(len(self), index)
 

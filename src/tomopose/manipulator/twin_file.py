@@ -152,7 +152,7 @@ def twin_drawing(document: Mapping[str, Any], where: str, *, folder: Path | None
     )
 
 
-def _machine(value: Any, where: str, folder: Path | None) -> ErrorModel | None:
+def _machine(value: object, where: str, folder: Path | None) -> ErrorModel | None:
     if value is None:
         return None
     if isinstance(value, str):
@@ -167,7 +167,7 @@ def _machine(value: Any, where: str, folder: Path | None) -> ErrorModel | None:
     raise InputError(f"{where} is {value!r}; the name of a robot's file, its content, or null is needed")
 
 
-def _object(document: Mapping[str, Any], key: str, known: tuple[str, ...], where: str) -> Mapping[str, Any]:
+def _object(document: Mapping[str, object], key: str, known: tuple[str, ...], where: str) -> Mapping[str, Any]:
     block = document[key]
     if not isinstance(block, Mapping):
         raise InputError(f"{where}: {key} is an object with {', '.join(known)}")
@@ -183,7 +183,7 @@ def _direction(value: Any, where: str) -> Array:
     return x / length
 
 
-def _sigma(block: Mapping[str, Any], key: str, default: float, where: str) -> float:
+def _sigma(block: Mapping[str, object], key: str, default: float, where: str) -> float:
     value = block.get(key, default)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not (np.isfinite(value) and value > 0):
         raise InputError(f"{where}: {key} is {value!r}; a standard deviation > 0 is needed")

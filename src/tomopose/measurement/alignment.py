@@ -12,6 +12,7 @@ from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.point_motion import rigid_motion
 from tomopose.geometry.rotations import exp_rotation, log_rotation
 from tomopose.measurement.features.shapes import frame_along
+from tomopose.robust import MAD_TO_SIGMA
 from tomopose.units import Array, float_array
 
 
@@ -137,7 +138,7 @@ def best_fit(start: Alignment, x_part: Array, normals: Array, distance: Array) -
     x, n = start.points(x_part), start.directions(normals)
     centre = x.mean(axis=0)
     J = np.hstack([np.cross(x - centre, n), n])
-    scale = 1.4826 * float(np.median(np.abs(distance - np.median(distance)))) or 1.0
+    scale = MAD_TO_SIGMA * float(np.median(np.abs(distance - np.median(distance)))) or 1.0
     w = np.minimum(1.0, 1.345 * scale / np.maximum(np.abs(distance), 1e-300))
     gram = (J * w[:, None]).T @ J
     if np.linalg.cond(gram) > 1e12:

@@ -19,9 +19,11 @@ from tomopose.measurement.regions import given
 from tomopose.measurement.result import FORMS, MeasurementResult
 from tomopose.measurement.results import MeasurementResults
 from tomopose.provenance import Provenance
+from tomopose.values import require_types
 from tomopose.volume import Volume
 
 
+@require_types
 def measure(
     volumes: Volume | Mapping[str, Volume],
     plan: MeasurementPlan,

@@ -322,7 +322,7 @@ class MeasurementPlan(_Strict):
         return self
 
 
-def plan_from(document: dict[str, Any], where: str = "plan") -> MeasurementPlan:
+def plan_from(document: dict[str, object], where: str = "plan") -> MeasurementPlan:
     """A plan from a document as TOML gives it.
 
     Raises SchemaVersionError for another schema, UnitError without unit = "mm", InputError for anything else wrong.

@@ -16,6 +16,7 @@ from tomopose.errors import InputError
 from tomopose.measurement.features.shapes import frame_along
 from tomopose.measurement.surface.edges import Edges, EdgeSettings, search_edges
 from tomopose.units import Array, float_array
+from tomopose.values import require_types
 from tomopose.volume import Volume
 
 
@@ -37,6 +38,7 @@ class Probing:
         return self.edges.good
 
 
+@require_types
 def probe(
     volume: Volume,
     points: npt.ArrayLike,

@@ -167,7 +167,7 @@ class MeasurementResults:
         return _table(BUDGET_COLUMNS, [b.to_json() for b in self.budgets()])
 
 
-def _table(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
+def _table(columns: Sequence[str], rows: Iterable[Mapping[str, object]]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)

@@ -29,7 +29,7 @@ from tomopose.planning.target import ScanTarget, scan_target
 from tomopose.trajectory.pose_grid import pose_grid
 from tomopose.trajectory.tilt import R_HT_MOUNTED
 from tomopose.units import Array
-from tomopose.values import value
+from tomopose.values import require_types, value
 
 SIGMA_PX = 0.0207 / np.sqrt(2.0)
 """Standard uncertainty of a coordinate of a centre: the paper's d_rms of 0.0207 px counts both (eq. 8)."""
@@ -228,6 +228,7 @@ class _Search:
         return poses, resolved
 
 
+@require_types
 def plan_poses(
     scanner: Scanner,
     *,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -88,7 +87,7 @@ def resolvability(
     )
 
 
-def telling(everything: Problem, index: Any, unresolved: Iterable[Hypothesis], n: int) -> list[int]:
+def telling(everything: Problem, index: object, unresolved: Iterable[Hypothesis], n: int) -> list[int]:
     """Candidates at which alternatives that fit the rows `index` of `everything` are farthest from the truth, n for
     each.
 

@@ -19,6 +19,7 @@ from tomopose.calibration.model.ball_projection import projection_blocks
 from tomopose.calibration.model.parameters import FreeParameters
 from tomopose.calibration.rigid.fit import tangent_names
 from tomopose.errors import InputError
+from tomopose.geometry.box import BOX_CORNERS
 from tomopose.geometry.rotations import skew
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
@@ -43,8 +44,7 @@ class ScanTarget:
 
 def box_points(half: Sequence[float] = OBJECT_MM) -> Array:
     """Corners and centre (9, 3) of a box about the W origin, mm."""
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    return np.concatenate([np.zeros((1, 3)), signs * np.asarray(half, dtype=np.float64)])
+    return np.concatenate([np.zeros((1, 3)), BOX_CORNERS * np.asarray(half, dtype=np.float64)])
 
 
 def default_scan(T_HT: RigidTransform, views: int = 90) -> PoseSequence:

@@ -87,7 +87,7 @@ class Piece:
         matrices: ProjectionMatrices,
         grid: VoxelGrid,
         support: np.ndarray | None,
-        options: dict[str, Any],
+        options: dict[str, object],
     ) -> None:
         self.grid = grid
         self._made = engine, matrices, options
@@ -153,7 +153,7 @@ class DiskField:
         matrices: ProjectionMatrices,
         grid: VoxelGrid,
         support: np.ndarray | None,
-        options: dict[str, Any],
+        options: dict[str, object],
         *,
         slabs: int,
         scratch: Path,
@@ -178,7 +178,7 @@ class DiskField:
             piece.put(mapped(self._file(i, self._generation)))
         return piece
 
-    def _sum(self, method: str, *arguments: Any, filled: bool = True) -> np.ndarray:
+    def _sum(self, method: str, *arguments: object, filled: bool = True) -> np.ndarray:
         total = getattr(self._piece(0, filled=filled), method)(*arguments)
         for i in range(1, len(self._bounds)):
             total = total + getattr(self._piece(i, filled=filled), method)(*arguments)
@@ -231,7 +231,7 @@ class DaskField:
         matrices: ProjectionMatrices,
         grid: VoxelGrid,
         support: np.ndarray | None,
-        options: dict[str, Any],
+        options: dict[str, object],
         *,
         slabs: int,
         client: Any,
@@ -255,10 +255,10 @@ class DaskField:
         ]
         self._pieces = [future.result() for future in futures]
 
-    def _all(self, method: str, *arguments: Any, **named: Any) -> list[Any]:
+    def _all(self, method: str, *arguments: object, **named: object) -> list[Any]:
         return [answer.result() for answer in [getattr(p, method)(*arguments, **named) for p in self._pieces]]
 
-    def _sum(self, method: str, *arguments: Any) -> np.ndarray:
+    def _sum(self, method: str, *arguments: object) -> np.ndarray:
         # In the order of the slabs, so that rounding does not depend on which worker is first.
         answers = self._all(method, *arguments)
         total = answers[0]

@@ -13,6 +13,7 @@ from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.reconstruction.choice import CUT_ROWS, FEWEST_FOR_FDK, Situation
 from tomopose.reconstruction.fdk.redundancy import lines_missing
 from tomopose.reconstruction.field import every_nth_pixel
+from tomopose.robust import MAD_TO_SIGMA
 from tomopose.units import Array
 from tomopose.volume import VoxelGrid
 
@@ -53,7 +54,7 @@ class Agreement:
     def suspicious(self) -> tuple[int, ...]:
         """The views whose residual is far above the others'."""
         median = float(np.median(self.residual))
-        spread = 1.4826 * float(np.median(np.abs(self.residual - median)))
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(self.residual - median)))
         limit = median + SUSPICIOUS * max(spread, 0.02 * median, 1e-6)
         return tuple(int(j) for j in np.flatnonzero(self.residual > limit))
 
@@ -62,7 +63,7 @@ def noise_of(p: Array) -> float:
     """Standard deviation of the noise of an image, robustly, from second differences along its rows."""
     if p.shape[1] < 3:
         return 0.0
-    return 1.4826 * float(np.median(np.abs(p[:, :-2] - 2 * p[:, 1:-1] + p[:, 2:]))) / math.sqrt(6)
+    return MAD_TO_SIGMA * float(np.median(np.abs(p[:, :-2] - 2 * p[:, 1:-1] + p[:, 2:]))) / math.sqrt(6)
 
 
 def agreement_of(

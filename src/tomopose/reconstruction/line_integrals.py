@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import scipy.ndimage
 import scipy.sparse
+from numpy.typing import ArrayLike
 
 from tomopose.errors import ConventionError, InputError, ShapeError
 from tomopose.geometry.projection import ProjectionMatrices
@@ -115,7 +116,7 @@ class LineIntegrals:
     Every fault is an InputError that names the view, how many pixels, and what to do.
     """
 
-    def __init__(self, images: Sequence[Any], matrices: ProjectionMatrices, correction: Correction) -> None:
+    def __init__(self, images: Sequence[object], matrices: ProjectionMatrices, correction: Correction) -> None:
         if not hasattr(images, "__len__"):
             raise InputError("the images need a length; give a list, an array (n, n_v, n_u) or open_images(...)")
         if len(images) != len(matrices):
@@ -139,7 +140,7 @@ class LineIntegrals:
         return len(self.matrices)
 
     @staticmethod
-    def _level(name: str, value: Any, shape: tuple[int, int]) -> np.ndarray:
+    def _level(name: str, value: object, shape: tuple[int, int]) -> np.ndarray:
         level = np.asarray(value, dtype=np.float32)
         if level.shape not in ((), shape):
             raise ShapeError(f"the {name} is {level.shape}; a number or an image {shape} (n_v, n_u) is needed")
@@ -240,9 +241,9 @@ def linearised(p: np.ndarray, coefficients: Sequence[float], j: int) -> np.ndarr
 
 
 def beam_hardening_polynomial(
-    energies_keV: Any,
-    fluence: Any,
-    attenuation_per_mm: Any,
+    energies_keV: ArrayLike,
+    fluence: ArrayLike,
+    attenuation_per_mm: ArrayLike,
     *,
     thickness_mm: float,
     reference_keV: float | None = None,

@@ -7,7 +7,6 @@ error where a spread order leaves 0.002 (docs/validation/reconstruction.md).
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from tomopose.errors import InputError
 GOLDEN = (math.sqrt(5) - 1) / 2
 
 
-def view_order(n: int, order: Any = "golden", *, seed: int = 0) -> np.ndarray:
+def view_order(n: int, order: object = "golden", *, seed: int = 0) -> np.ndarray:
     """A permutation of n views: "golden", "random" (from `seed`), "sequential", or the n indices themselves.
 
     "golden": step k takes the view whose rank among n is that of k GOLDEN mod 1, so that any run of consecutive steps

@@ -34,11 +34,13 @@ from tomopose.reconstruction.settings import (
     with_earlier,
 )
 from tomopose.reconstruction.work import Work, solve
+from tomopose.values import require_types
 from tomopose.volume import Volume, VoxelGrid
 
 Image = npt.NDArray[np.generic]
 
 
+@require_types
 def reconstruct(
     images: Sequence[Image],
     matrices: ProjectionMatrices,

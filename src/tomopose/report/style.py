@@ -29,7 +29,7 @@ DIVERGING = [[0.0, "#1f5f99"], [0.25, "#8db8dc"], [0.5, "#f7f7f5"], [0.75, "#e3a
 SEQUENTIAL = [[0.0, "#0b2d57"], [0.35, "#2f77a8"], [0.65, "#8fbf9f"], [1.0, "#f2d16b"]]
 
 
-def axis(title: str = "", **changes: Any) -> dict[str, Any]:
+def axis(title: str = "", **changes: object) -> dict[str, Any]:
     """A two-dimensional axis."""
     return {
         "title": {"text": title, "standoff": 8, "font": {"size": 12.5}},
@@ -46,7 +46,7 @@ def axis(title: str = "", **changes: Any) -> dict[str, Any]:
     }
 
 
-def layout(**changes: Any) -> dict[str, Any]:
+def layout(**changes: object) -> dict[str, Any]:
     """The layout that every figure begins from."""
     return {
         "font": {"family": FONT, "size": 12.5, "color": INK},
@@ -62,7 +62,7 @@ def layout(**changes: Any) -> dict[str, Any]:
     }
 
 
-def space_axis(title: str, **changes: Any) -> dict[str, Any]:
+def space_axis(title: str, **changes: object) -> dict[str, Any]:
     """An axis of a 3-D scene, mm."""
     return {
         "title": {"text": title, "font": {"size": 12}},
@@ -75,7 +75,7 @@ def space_axis(title: str, **changes: Any) -> dict[str, Any]:
     }
 
 
-def colour_bar(title: str, **changes: Any) -> dict[str, Any]:
+def colour_bar(title: str, **changes: object) -> dict[str, Any]:
     return {
         "title": {"text": title, "side": "right", "font": {"size": 12}},
         "thickness": 12,
@@ -86,7 +86,7 @@ def colour_bar(title: str, **changes: Any) -> dict[str, Any]:
     }
 
 
-def label(text: str, x: float, y: float, **changes: Any) -> dict[str, Any]:
+def label(text: str, x: float, y: float, **changes: object) -> dict[str, Any]:
     """A line of text in a figure's own coordinates (0 .. 1)."""
     return {
         "text": text,

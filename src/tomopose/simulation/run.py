@@ -35,6 +35,7 @@ from tomopose.simulation.projector.meshes import add_mesh_transmission
 from tomopose.simulation.projector.rays import Compiled, compile_solids
 from tomopose.simulation.projector.view import View, enclosing, shadow
 from tomopose.units import Array, float_array
+from tomopose.values import require_types
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,6 +230,7 @@ def ball_spectrum(voltage: float = 120.0, copper: float = 0.5) -> Spectrum:
     return tube_spectrum(voltage).filtered("Cu", copper).absorbed_energy("CsI", 0.6)
 
 
+@require_types
 def simulate_ball_run(
     scanner: Scanner,
     *,

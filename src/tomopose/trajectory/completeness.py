@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.units import Array
+from tomopose.values import require_types
 
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
@@ -64,6 +65,7 @@ def object_points(radius: float, z_low: float, z_high: float, *, spacing: float)
     return inside
 
 
+@require_types
 def tuy_completeness(path: Array, points: Array, *, n_planes: int = 2000) -> Completeness:
     """Share of planes through each point (m, 3) that meet the source path (n, 3), mm, both in the object's frame.
 

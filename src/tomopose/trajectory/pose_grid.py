@@ -13,6 +13,7 @@ from tomopose.geometry.rotations import rotation_from_angles
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.units import Array
+from tomopose.values import require_types
 
 HALF_RANGE_MM = 10.0
 TILT = math.radians(5.0)
@@ -52,6 +53,7 @@ def grid_positions(n: int | Sequence[int], half_range: float | Sequence[float] =
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
+@require_types
 def pose_grid(
     n: int | Sequence[int] = 3,
     *,

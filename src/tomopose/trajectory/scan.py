@@ -14,6 +14,7 @@ from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.trajectory.tilt import R_HT_MOUNTED, eq10_rotation
 from tomopose.units import Array
+from tomopose.values import require_types
 
 Wave = Callable[[Array], Array]
 
@@ -50,11 +51,13 @@ def scan(
     )
 
 
+@require_types
 def circular_scan(n: int, *, direction: Literal[1, -1] = 1) -> PoseSequence:
     """One turn of the table with the manipulator at zero: the reference scan of paper sec. 6.1."""
     return scan(table_angles(n, direction=direction))
 
 
+@require_types
 def tilted_scan(
     n: int,
     tilt: Wave,

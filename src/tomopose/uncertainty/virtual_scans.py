@@ -24,6 +24,7 @@ from tomopose.calibration.model.parameters import base_name
 from tomopose.calibration.result import Calibration
 from tomopose.calibration.uncertainty.trajectory import pixels, point_jacobian
 from tomopose.errors import InputError
+from tomopose.geometry.box import BOX_CORNERS
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
 from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.geometry.scanner import Scanner
@@ -55,7 +56,7 @@ def simulated_errors(
     draws: int,
     calibration: Calibration | None = None,
     seed: int = 0,
-    options: Mapping[str, Any] | None = None,
+    options: Mapping[str, object] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Mapping[str, Simulated]:
     """Measurand -> its error over `draws` virtual scans: mean, u, shortest 95 % interval, mm or rad.
@@ -199,8 +200,8 @@ def _object_held(P: Array, P_true: Array, grid: VoxelGrid) -> Array:
     Drawn errors may move the object as a whole, on which no length depends, out of reach of the plan's nominal places.
     """
     half = grid.spacing * np.array(grid.n_xyz) / 4
-    signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), axis=-1).reshape(-1, 3)
-    corners, seen = signs * half, pixels(P_true, grid.centre + signs * half)
+    corners = BOX_CORNERS * half
+    seen = pixels(P_true, grid.centre + corners)
     motion = np.eye(4)
     motion[:3, 3] = grid.centre
     for _ in range(POSE_STEPS):

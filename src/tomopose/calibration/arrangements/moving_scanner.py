@@ -21,8 +21,10 @@ from tomopose.manipulator.inverse import InverseManipulator, inverse_poses
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.units import Array
+from tomopose.values import require_types
 
 
+@require_types
 def calibrate_inverse(
     scanner: Scanner,
     poses: PoseSequence,

@@ -20,6 +20,7 @@ from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.twin import TwinRobots
 from tomopose.observations import BallObservations
+from tomopose.values import require_types
 
 OF_TABLES = ("table sign", "table zero", "image turned by 180 degrees and table sign")
 """Readings of a rotary table, which twin robots do not have."""
@@ -28,6 +29,7 @@ FEW_STEPS = 25
 """Steps after which a reading that has found no optimum is given up; the right one takes less than ten."""
 
 
+@require_types
 def diagnose_twin(
     scanner: Scanner,
     poses: PoseSequence,

@@ -36,6 +36,7 @@ from tomopose.manipulator.twin import TwinRobots
 from tomopose.observations import BallObservations
 from tomopose.provenance import provenance
 from tomopose.units import Array
+from tomopose.values import require_types
 
 MODELS = ("auto", "rigid", "kinematic")
 PANEL = ("p_u", "p_v", "pitch_ratio")
@@ -65,6 +66,7 @@ def panel_parameters(
     return free_parameters((scanner,), free=free, fix=(*fix, *held), priors=priors)
 
 
+@require_types
 def calibrate_twin(
     scanner: Scanner,
     poses: PoseSequence,
@@ -231,6 +233,7 @@ def _twin_of(calibration: Calibration, source_poses: PoseSequence) -> tuple[Twin
     return calibration.errors.robots(source_poses), calibration.errors.values
 
 
+@require_types
 def twin_matrices(
     calibration: Calibration,
     poses: PoseSequence,

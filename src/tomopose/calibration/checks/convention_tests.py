@@ -41,6 +41,7 @@ from tomopose.manipulator.inverse import inverse_poses
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.units import Array
+from tomopose.values import require_types
 
 SAME, BETTER = 9.0, 25.0
 """delta below SAME (3 sigma): cannot be distinguished.  delta below -BETTER (5 sigma): the alternative fits better."""
@@ -536,6 +537,7 @@ def set_pose_alternative(problem: Problem, poses: PoseSequence | Iterable[PoseSe
     )
 
 
+@require_types
 def diagnose(
     scanner: Scanner | Sequence[Scanner],
     poses: PoseSequence | Sequence[PoseSequence],

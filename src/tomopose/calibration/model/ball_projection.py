@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit
+from numpy.typing import ArrayLike
 
 from tomopose.geometry.rotations import skew
 from tomopose.geometry.scanner import Scanner
@@ -272,8 +273,8 @@ def projection_blocks(
     *,
     T_HT: RigidTransform,
     T_MH: RigidTransform,
-    t: Any,
-    alpha: Any = 0.0,
+    t: ArrayLike,
+    alpha: ArrayLike = 0.0,
     translation_scale: float = 1.0,
     run: Any = None,
 ) -> ProjectionBlocks:

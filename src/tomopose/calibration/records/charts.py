@@ -15,6 +15,7 @@ from scipy.special import ndtr, stdtr, stdtrit
 from tomopose.calibration.records.history import Entry
 from tomopose.errors import InputError
 from tomopose.units import Array
+from tomopose.values import require_types
 
 LIMIT_SIGMAS = 3.0
 """Limits hold a run with the probability of three standard deviations of a normal value, 0.9973; a scatter that is
@@ -122,6 +123,7 @@ def _limits(value: Array, u: Array, judges: np.ndarray) -> tuple[Array, Array]:
     return low, high
 
 
+@require_types
 def control_chart(entries: Iterable[Entry], name: str) -> ControlChart:
     """The chart of a parameter ("t_HT_x", ...) or of "d_rms_px".  InputError with fewer than three entries."""
     runs = list(entries)

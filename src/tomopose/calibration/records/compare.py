@@ -14,6 +14,7 @@ from tomopose.errors import InputError
 from tomopose.geometry.rotations import log_rotation
 from tomopose.manipulator.poses import PIVOT_TOLERANCE_MM
 from tomopose.units import Array
+from tomopose.values import require_types
 
 SIGNIFICANT = 0.01
 NOT_TESTED = (float("nan"), float("nan"))
@@ -81,6 +82,7 @@ def _together(d: Array, C: Array) -> tuple[float, float]:
     return chi2, float(chdtrc(len(d), chi2))
 
 
+@require_types
 def compare(a: Calibration, b: Calibration) -> Comparison:
     """The change from calibration a to calibration b, taken as independent: C_a + C_b.
 

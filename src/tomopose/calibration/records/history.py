@@ -20,6 +20,7 @@ from tomopose.calibration.result import Calibration
 from tomopose.errors import FileError, InputError, SchemaVersionError
 from tomopose.files import write_text
 from tomopose.reading import parse_json, read_text, reader
+from tomopose.values import require_types
 
 SCHEMA = "tomopose/history/1"
 
@@ -99,6 +100,7 @@ def write_history(path: str | Path, entries: Sequence[Entry]) -> None:
     write_text(Path(path), "".join(json.dumps(e, ensure_ascii=False, allow_nan=True) + "\n" for e in entries))
 
 
+@require_types
 def append_history(
     path: str | Path, calibration: Calibration, *, label: str = "", machine: str = ""
 ) -> list[dict[str, Any]]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError
 from tomopose.geometry.projection import project_ball
@@ -14,10 +14,11 @@ from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.units import Array
+from tomopose.values import require_types
 
 
 def d_exact(
-    scanner: Scanner, poses: PoseSequence, observations: BallObservations, *, T_HT: RigidTransform, t: Any
+    scanner: Scanner, poses: PoseSequence, observations: BallObservations, *, T_HT: RigidTransform, t: ArrayLike
 ) -> Array:
     """d_k (m,), px, of the m observations that count as seen: their distance from the exact centres.  Eq. (9).
 
@@ -35,8 +36,9 @@ def d_exact(
     return np.linalg.norm(used.x_D - exact, axis=1)
 
 
+@require_types
 def d_rms_exact(
-    scanner: Scanner, poses: PoseSequence, observations: BallObservations, *, T_HT: RigidTransform, t: Any
+    scanner: Scanner, poses: PoseSequence, observations: BallObservations, *, T_HT: RigidTransform, t: ArrayLike
 ) -> float:
     """Error of the detection itself, px, rms over the seen poses.  Eq. (9)."""
     d = d_exact(scanner, poses, observations, T_HT=T_HT, t=t)

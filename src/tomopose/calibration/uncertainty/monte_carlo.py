@@ -23,6 +23,7 @@ from tomopose.geometry.scanner import Scanner
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.units import Array
+from tomopose.values import require_types
 
 BATCH = 2000
 ITERATIONS = 20
@@ -105,6 +106,7 @@ def draw(
     )
 
 
+@require_types
 def monte_carlo(
     calibration: Calibration,
     scanner: Scanner | Sequence[Scanner],

@@ -7,9 +7,8 @@ dx_T = (1 - A) dt + w x (R_HT x_H,j) - A (w x (x_W - t_HT)), A = R_HT R_j R_HT^T
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.model.parameters import base_name
@@ -72,7 +71,7 @@ def matrix_point_jacobian(calibration: Calibration, poses: PoseSequence, x_W: Ar
     return result
 
 
-def matrix_point_sigma(calibration: Calibration, poses: PoseSequence, x_W: Any) -> Array:
+def matrix_point_sigma(calibration: Calibration, poses: PoseSequence, x_W: ArrayLike) -> Array:
     """(n, m) px: predicted standard uncertainty (root of the mean of the two variances) of points x_W (m, 3) in W."""
     J = matrix_point_jacobian(calibration, poses, np.asarray(x_W, dtype=np.float64))
     V = np.einsum("nmic,cd,nmid->nmi", J, calibration.covariance, J)
@@ -88,7 +87,7 @@ def tilt_sigma(calibration: Calibration, tilt: float = TILT) -> float:
     return float(np.sqrt(np.mean(sigma**2)))
 
 
-def apparent_displacement(calibration: Calibration, poses: PoseSequence, x_W: Any) -> Array:
+def apparent_displacement(calibration: Calibration, poses: PoseSequence, x_W: ArrayLike) -> Array:
     """(m, 3, c) mm: where points x_W (m, 3) come to lie in a reconstruction, by the calibration's errors.
 
     A point is reconstructed where its images under the wrong matrices fit best: G dx = -J e in the least squares over
@@ -103,13 +102,13 @@ def apparent_displacement(calibration: Calibration, poses: PoseSequence, x_W: An
     return -np.linalg.solve(N, np.einsum("nmia,nmic->mac", G, J))
 
 
-def object_sigma(calibration: Calibration, poses: PoseSequence, x_W: Any) -> Array:
+def object_sigma(calibration: Calibration, poses: PoseSequence, x_W: ArrayLike) -> Array:
     """(m, 3) mm: standard uncertainty of each coordinate of points x_W (m, 3) in a reconstruction of this scan."""
     B = apparent_displacement(calibration, poses, x_W)
     return np.sqrt(np.einsum("mac,cd,mad->ma", B, calibration.covariance, B))
 
 
-def scan_displacement(calibration: Calibration, poses: PoseSequence, x_W: Any) -> tuple[Array, Array]:
+def scan_displacement(calibration: Calibration, poses: PoseSequence, x_W: ArrayLike) -> tuple[Array, Array]:
     """(B (m, 3, c) mm, C (c, c)): where points x_W (m, 3) come to lie, by everything that was estimated or assumed.
 
     As `apparent_displacement`, for every model, with what no ball shows beside the calibration's coordinates; the rigid
@@ -126,7 +125,7 @@ def scan_displacement(calibration: Calibration, poses: PoseSequence, x_W: Any) -
     return -np.linalg.solve(N, np.einsum("nmia,nmic->mac", G, J, optimize=True)), C
 
 
-def length_sigma(calibration: Calibration, poses: PoseSequence, x_a: Any, x_b: Any) -> Array:
+def length_sigma(calibration: Calibration, poses: PoseSequence, x_a: ArrayLike, x_b: ArrayLike) -> Array:
     """(m,) mm: standard uncertainty, from the calibration and all that it assumed, of the lengths between points x_a
     and x_b (m, 3) of W in a reconstruction of this scan."""
     a, b = np.atleast_2d(np.asarray(x_a, dtype=np.float64)), np.atleast_2d(np.asarray(x_b, dtype=np.float64))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.model.unseen import unseen_columns
@@ -41,7 +42,7 @@ def pixels(P: Array, x: Array) -> Array:
     return h[..., :2] / h[..., 2:]
 
 
-def without_object_pose(P: Any, P_true: Any, points: Any) -> Array:
+def without_object_pose(P: ArrayLike, P_true: ArrayLike, points: ArrayLike) -> Array:
     """Differences (n, m, 2), px, of the points' pixels under P and P_true, the best rigid object pose removed.
 
     The pose is the one that minimises their sum of squares, found by Gauss-Newton.
@@ -67,7 +68,7 @@ def rms_px(d: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(d**2, axis=-1))))
 
 
-def trajectory_jacobian(calibration: Calibration, poses: PoseSequence, points: Any) -> tuple[Array, Array]:
+def trajectory_jacobian(calibration: Calibration, poses: PoseSequence, points: ArrayLike) -> tuple[Array, Array]:
     """How the scan's pixels answer to what was estimated, with the object's rigid pose removed.
 
     Returns J (n, m, 2, c): derivatives, px, of points (m, 3) of W at home by the coordinates of `calibration.tangent`,
@@ -78,7 +79,7 @@ def trajectory_jacobian(calibration: Calibration, poses: PoseSequence, points: A
     return columns[..., : len(calibration.tangent)], J_pose
 
 
-def plate_points(calibration: Calibration, points: Any) -> Array:
+def plate_points(calibration: Calibration, points: ArrayLike) -> Array:
     """(m, 3) mm in M: points of W at home."""
     x = np.asarray(points, dtype=np.float64)
     return np.asarray((calibration.scanner.T_TW(0.0).inv.apply(x) - calibration.T_HT.t) @ calibration.T_HT.R)
@@ -170,7 +171,9 @@ def shared_variance(calibration: Calibration, poses: PoseSequence, x_M: Array) -
     return np.asarray(np.einsum("nmic,cd,nmid->nmi", J, C, J, optimize=True))
 
 
-def trajectory_sigma(calibration: Calibration, poses: PoseSequence, points: Any, *, scatter: bool = False) -> Array:
+def trajectory_sigma(
+    calibration: Calibration, poses: PoseSequence, points: ArrayLike, *, scatter: bool = False
+) -> Array:
     """(n, m, 2) px: standard uncertainty of points (m, 3) of W at home in a scan, the object's rigid pose removed.
 
     scatter: add the manipulator's scatter from pose to pose, for the single view; else the part that views share.

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tomopose.detection.flags import expected_radius, motion_length
-from tomopose.detection.image import checked_diameter, require_types
+from tomopose.detection.image import checked_diameter
 from tomopose.detection.reading import Image, region_about
 from tomopose.detection.run.checks import (
     Row,
@@ -31,8 +31,10 @@ from tomopose.geometry.scanner import Scanner
 from tomopose.kept import key_of
 from tomopose.observations import BallObservations
 from tomopose.units import Array
+from tomopose.values import require_types
 
 
+@require_types
 def detect(
     images: Iterable[Any],
     scanner: Scanner,
@@ -82,7 +84,6 @@ def detect(
                 image and more than 5 % of them, or all, are unusable (unreadable, of the wrong size, bytes or pitches
                 exchanged); where the ball has 20 % more or less than its nominal size in every image.
     """
-    require_types(scanner, settings)
     run = _run(
         images, scanner, diameters=_Diameters(ball_diameter, ball_id), pose_id=pose_id, predicted=predicted,
         origin=origin, journal=journal, settings=settings,

@@ -27,7 +27,7 @@ def fault_of_input(image: Any, scanner: Scanner, **options: Any) -> InputError |
         other = replace(scanner, p_u=scanner.p_v, p_v=scanner.p_u)
         try:
             detect_image(image, other, **options)
-        except (TomoposeError, OSError, ValueError, EOFError):
+        except TomoposeError:
             return None
         return InputError(
             f"p_u = {scanner.p_u:g} mm and p_v = {scanner.p_v:g} mm are exchanged: the other way round there is a ball"

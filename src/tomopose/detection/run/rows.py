@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,6 +24,7 @@ from tomopose.errors import (
     BallNotFoundError,
     BallTruncatedError,
     DetectionError,
+    InputError,
     TomoposeError,
 )
 from tomopose.geometry.scanner import Scanner
@@ -30,7 +33,19 @@ from tomopose.units import Array
 LAG_SHIFT = 0.3
 """Shift of the centre, px per unit share of lag, that is allowed for where the corrected image cannot be measured.
 Assumed from one reported case, in which a lag of about 3 % moved a centre by 0.0085 px; not measured here."""
-EXPECTED_ERRORS = (TomoposeError, OSError, ValueError, EOFError)
+UNREADABLE = (OSError, ValueError, EOFError)
+"""What a sequence of images raises where a file is damaged, or where an entry is not an array of one shape."""
+
+
+@contextlib.contextmanager
+def reading_image() -> Iterator[None]:
+    """What goes wrong while pixels are read is a fault of the image; what goes wrong later would be ours."""
+    try:
+        yield
+    except TomoposeError:
+        raise
+    except UNREADABLE as error:
+        raise InputError(f"{error or type(error).__name__}") from error
 
 
 class LazyImage:
@@ -44,10 +59,12 @@ class LazyImage:
         shape = getattr(self.images, "shape", None)
         if shape is not None:
             return tuple(shape)[-2:]
-        return tuple(np.shape(self.images[self.index]))  # type: ignore[index]
+        with reading_image():
+            return tuple(np.shape(self.images[self.index]))  # type: ignore[index]
 
     def region(self, v0: int, v1: int, u0: int, u1: int) -> Array:
-        return np.asarray(self.images.region(self.index, v0, v1, u0, u1))  # type: ignore[attr-defined]
+        with reading_image():
+            return np.asarray(self.images.region(self.index, v0, v1, u0, u1))  # type: ignore[attr-defined]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,14 +93,15 @@ def row_of(image: Image, task: Task, done: Row | None, *, work: Work) -> Row:
     row: Row = {"name": task.name, "key": "", "form": list(NO_FORM)}
     try:
         if not isinstance(image, LazyImage):
-            image = np.asarray(image)
+            with reading_image():
+                image = np.asarray(image)
         row["form"] = [list(image.shape), getattr(getattr(image, "dtype", None), "name", "")]
         if work.keyed and len(image.shape) == 2:
             row["key"] = fingerprint(image, task.predicted, task.origin)
             if done is not None and done.get("key") == row["key"]:
                 return done
         return _measured(row, image, task, work)
-    except EXPECTED_ERRORS as error:
+    except TomoposeError as error:
         return _refused(row, error)
 
 
@@ -131,7 +149,7 @@ def _corrected(row: Row, image: Image, previous: Image, lag: Lag, task: Task, wo
             other_diameters=task.other_diameters, predicted=row["x_D"], origin=task.origin, mask=work.mask,
             settings=work.settings,
         )  # fmt: skip
-    except EXPECTED_ERRORS:
+    except TomoposeError:
         return _widened(row, LAG_SHIFT * lag.share * np.eye(2))
     shift = np.asarray(row["x_D"]) - corrected.x_D
     row = row | _numbers(corrected) | {"flags": row["flags"]}

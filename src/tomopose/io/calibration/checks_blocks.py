@@ -25,7 +25,7 @@ def flat(value: Any) -> dict[str, Any]:
     return {name: encode(v) if isinstance(v, float) else v for name, v in row.items()}
 
 
-def number(value: Any) -> float:
+def number(value: object) -> float:
     """A number as `encode` writes it."""
     return float(decode_array(value))
 
@@ -164,7 +164,7 @@ def comparison_from(row: Mapping[str, Any]) -> ModelComparison:
     )
 
 
-def pose_noise_from(row: Mapping[str, Any]) -> PoseNoiseFound:
+def pose_noise_from(row: Mapping[str, object]) -> PoseNoiseFound:
     values = {f.name: number(row[f.name]) for f in fields(PoseNoiseFound) if f.name != "found"}
     return PoseNoiseFound(**values, found=bool(row.get("found", True)))
 

@@ -64,7 +64,7 @@ def errors_document(errors: Errors) -> dict[str, Any]:
     return block
 
 
-def errors_from_document(block: Mapping[str, Any], *, inverse: bool = False) -> Errors:
+def errors_from_document(block: Mapping[str, object], *, inverse: bool = False) -> Errors:
     """The errors in a block; inverse: of tables of inverse poses, whose plate turns about H.
 
     Raises InputError where the block is damaged.
@@ -160,6 +160,6 @@ def _range_document(limits: PoseRange) -> dict[str, Any]:
     }
 
 
-def _range(block: Mapping[str, Any]) -> PoseRange:
+def _range(block: Mapping[str, object]) -> PoseRange:
     (t_low, t_high), (w_low, w_high) = (decode_array(block[k], 2, 3) for k in ("t_mm", "w_rad"))
     return PoseRange(t_low=t_low, t_high=t_high, w_low=w_low, w_high=w_high)

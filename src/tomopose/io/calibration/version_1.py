@@ -67,14 +67,14 @@ def _priors(document: Mapping[str, Any]) -> dict[str, Any]:
     return {name: stated.get(name.split("[")[0], "inf") for name in names}
 
 
-def _manipulator(block: Mapping[str, Any], noise: Mapping[str, Any] | None) -> dict[str, Any]:
+def _manipulator(block: Mapping[str, object], noise: Mapping[str, object] | None) -> dict[str, Any]:
     if "scatter" in block or noise is None:
         return dict(block)
     about_plate = {"t_mm": [noise["translation_mm"]] * 3, "w_rad": [noise["rotation_rad"]] * 3, "about": "plate"}
     return {**block, "scatter": about_plate}
 
 
-def _comparison(extra: Mapping[str, Any]) -> dict[str, Any] | None:
+def _comparison(extra: Mapping[str, object]) -> dict[str, Any] | None:
     if not extra.get("models"):
         return None
     return {
@@ -84,7 +84,7 @@ def _comparison(extra: Mapping[str, Any]) -> dict[str, Any] | None:
     }
 
 
-def _run(scanner: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+def _run(scanner: Mapping[str, object], values: Mapping[str, object]) -> dict[str, Any]:
     """The scanner of one of several runs: schema 1 kept its parameters without their units."""
     own = {f"{name}_{unit}": values[name] for name, unit in PARAMETER_UNITS.items() if name in values}
     return {**scanner, **own}

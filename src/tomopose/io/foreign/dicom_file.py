@@ -8,7 +8,7 @@ from typing import Any
 from tomopose.io.foreign.foreign_file import ForeignFile
 from tomopose.io.foreign.kind import Kind
 from tomopose.io.foreign.scanner_draft import ScannerDraft, sensible
-from tomopose.io.images.dicom import stated_geometry
+from tomopose.io.images.formats.dicom import stated_geometry
 from tomopose.reading import reading
 
 

@@ -74,8 +74,8 @@ def read_moments(path: Path) -> Moments:
 
 
 def _image_times(folder: Path) -> Moments:
+    from tomopose.io.images.formats.tiff import date_time
     from tomopose.io.images.opening import find_files
-    from tomopose.io.images.tiff import date_time
 
     files = find_files(folder)
     stamps = [date_time(f) for f in files]

@@ -133,7 +133,7 @@ def _json_matrices(file: ForeignFile) -> Array | None:
     return found[0] if len(found) == 1 else None
 
 
-def _as_matrices(value: Any) -> Array | None:
+def _as_matrices(value: object) -> Array | None:
     try:
         T = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):

@@ -1,6 +1,6 @@
 """NXtomo (NeXus): the scanner of an entry, and the table angle and translations of its sample as poses.
 
-Source: NeXus application definition NXtomo; nxtomo 3.  io/images/nexus.py reads values with their units.
+Source: NeXus application definition NXtomo; nxtomo 3.  io/images/formats/nexus.py reads values with their units.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from tomopose.io.foreign.foreign_file import ForeignFile
 from tomopose.io.foreign.kind import Kind
 from tomopose.io.foreign.pose_log import PoseLog, PoseOptions
 from tomopose.io.foreign.scanner_draft import ScannerDraft, sensible
-from tomopose.io.images.nexus import DATA, KEYS, LENGTHS, NexusValues, entries, stated_by
+from tomopose.io.images.formats.nexus import DATA, KEYS, LENGTHS, NexusValues, entries, stated_by
 from tomopose.reading import reading
 from tomopose.reading.hdf5 import checked_hdf5
 

@@ -11,7 +11,7 @@ from contextlib import closing
 from tomopose.io.foreign.foreign_file import ForeignFile
 from tomopose.io.foreign.kind import Kind
 from tomopose.io.foreign.scanner_draft import ScannerDraft, sensible
-from tomopose.io.images.xradia import first, numbers, open_container, stated_by
+from tomopose.io.images.formats.xradia import first, numbers, open_container, stated_by
 from tomopose.reading import reading
 
 OLE = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"

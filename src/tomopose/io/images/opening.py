@@ -16,17 +16,18 @@ from tomopose.files import natural_key
 from tomopose.geometry.scanner import Scanner
 from tomopose.io.images.checks import endianness_note, require_scanner_shape
 from tomopose.io.images.correction import correction, require_uncorrected
-from tomopose.io.images.dicom import open_dicom
+from tomopose.io.images.formats.dicom import open_dicom
+from tomopose.io.images.formats.hdf5 import Hdf5Source, open_hdf5
+from tomopose.io.images.formats.orientation import TURNS, UprightSource
+from tomopose.io.images.formats.raw import RawLayout, open_raw
+from tomopose.io.images.formats.tiff import open_tiff
+from tomopose.io.images.formats.xim import open_xim
+from tomopose.io.images.formats.xradia import XradiaSource, open_xradia
 from tomopose.io.images.frames import FrameSource, Image, missing_numbers
-from tomopose.io.images.hdf5 import Hdf5Source, open_hdf5
-from tomopose.io.images.orientation import TURNS, UprightSource
-from tomopose.io.images.raw import RawLayout, open_raw
 from tomopose.io.images.sequence import ImageSequence, Rows
 from tomopose.io.images.stated import contradictions
-from tomopose.io.images.tiff import open_tiff
-from tomopose.io.images.xim import open_xim
-from tomopose.io.images.xradia import XradiaSource, open_xradia
 from tomopose.reading import reading
+from tomopose.values import require_types
 
 SUFFIXES = {
     ".tif": "TIFF",
@@ -66,6 +67,7 @@ SHOWN = 5
 Source = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 
+@require_types
 def open_images(
     source: Source,
     scanner: Scanner | None = None,

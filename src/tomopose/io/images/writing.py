@@ -11,6 +11,7 @@ from tomopose.errors import InputError
 from tomopose.files import atomic_file, require_absent
 from tomopose.io.images.frames import Image
 from tomopose.io.images.sequence import Rows
+from tomopose.values import require_types
 
 CHUNK_ROWS = 64
 """So that a small region costs a small read."""
@@ -21,6 +22,7 @@ def file_rows(image: Image, rows: Rows) -> Image:
     return np.ascontiguousarray(image[::-1] if rows == "top-first" else image)
 
 
+@require_types
 def write_tiff(path: str | Path, image: Image, *, rows: Rows = "top-first", force: bool = False) -> None:
     """One image[v, u] as a plain TIFF; its type is kept.  FileError if the file exists and `force` is not given."""
     import tifffile
@@ -31,6 +33,7 @@ def write_tiff(path: str | Path, image: Image, *, rows: Rows = "top-first", forc
         tifffile.imwrite(temporary, file_rows(image, rows), photometric="minisblack", metadata=None)
 
 
+@require_types
 def write_hdf5(
     path: str | Path,
     images: Iterable[Image],

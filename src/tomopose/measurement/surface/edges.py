@@ -21,6 +21,7 @@ from tomopose.errors import InputError, ShapeError
 from tomopose.measurement.surface import edge_kernel as kernel
 from tomopose.measurement.surface.plateaus import shared_plateaus
 from tomopose.measurement.surface.splines import REACH, spline_coefficients
+from tomopose.robust import MAD_TO_SIGMA
 from tomopose.units import Array, float_array
 from tomopose.volume import Volume
 
@@ -265,7 +266,7 @@ def _lengthen(result: Array, flags: np.ndarray) -> int:
     more = n * (found[:, [kernel.INSIDE, kernel.OUTSIDE]] - found[:, [kernel.A, kernel.B]])
     change = np.column_stack([bb * more[:, 0] - ab * more[:, 1], aa * more[:, 1] - ab * more[:, 0]]) / det[:, None]
     median = np.median(change, axis=0)
-    spread = 1.4826 * np.median(np.abs(change - median), axis=0)
+    spread = MAD_TO_SIGMA * np.median(np.abs(change - median), axis=0)
     # Neighbours share voxels: every fourth counts.
     certain = np.abs(median) + 2 * 1.2533 * spread / np.sqrt(len(rows) / 4)
     if (certain > LEVEL * np.median(found[:, kernel.A] - found[:, kernel.B])).any():

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
+from tomopose.robust import MAD_TO_SIGMA
 from tomopose.units import Array
 
 ONE_SIDED = 0.15
@@ -45,7 +46,7 @@ def shared_plateaus(points: Array, normals: Array, own: Array, radius: float) ->
     inner = _inner(x, n, key, size, radius)
     shared, count = _trimmed_means(x, n, values, key, size, radius, inner)
     unlike = np.abs(shared - values)
-    usual = 1.4826 * np.median(unlike[inner], axis=0) if inner.any() else np.zeros(2)
+    usual = MAD_TO_SIGMA * np.median(unlike[inner], axis=0) if inner.any() else np.zeros(2)
     kept = ~inner | (unlike > UNLIKE * usual).any(axis=1)
     shared[kept], count[kept] = values[kept], 1.0
     back = np.argsort(order)

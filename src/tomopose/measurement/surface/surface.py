@@ -28,6 +28,7 @@ from tomopose.measurement.surface.splines import (
     smoothed_gradients,
 )
 from tomopose.units import Array, float_array
+from tomopose.values import require_types
 from tomopose.volume import Volume
 
 SurfaceMethod = Literal["esf", "local-50", "iso-50"]
@@ -87,6 +88,7 @@ class Surface:
         return np.maximum(area, LEAST_AREA * area.mean())
 
 
+@require_types
 def surface(
     volume: Volume,
     *,

@@ -37,7 +37,7 @@ def _line(points: ArrayLike, colour: str, name: str = "", *, width: float = 3, d
     }
 
 
-def _points(points: ArrayLike, name: str, **marker: Any) -> dict[str, Any]:
+def _points(points: ArrayLike, name: str, **marker: object) -> dict[str, Any]:
     x = np.atleast_2d(np.asarray(points, dtype=np.float64))
     return {
         "type": "scatter3d",
@@ -63,7 +63,7 @@ def _triad(frame: RigidTransform, length: float, name: str) -> list[dict[str, An
     return traces
 
 
-def _scene(**changes: Any) -> dict[str, Any]:
+def _scene(**changes: object) -> dict[str, Any]:
     scene = {
         "xaxis": space_axis("x / mm"),
         "yaxis": space_axis("y / mm"),

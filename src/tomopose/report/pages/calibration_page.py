@@ -56,7 +56,7 @@ def calibration_report(
     poses: PoseSequence | None,
     thumbnails: Sequence[Thumbnail] = (),
     scan: ProjectionMatrices | None = None,
-    history: Sequence[Mapping[str, Any]] = (),
+    history: Sequence[Mapping[str, object]] = (),
     title: str = "Calibration report",
 ) -> str:
     """One offline HTML document about a calibration.

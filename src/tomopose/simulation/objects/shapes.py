@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError, ShapeError
+from tomopose.geometry.box import BOX_CORNERS
 from tomopose.geometry.frames import Frame
 from tomopose.units import Array
 
@@ -101,8 +102,7 @@ class Primitive(Shape):
         return self.t, self.radius
 
     def corners(self) -> Array:
-        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
-        return (signs * self.half) @ self.R.T + self.t
+        return (BOX_CORNERS * self.half) @ self.R.T + self.t
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,8 +6,6 @@ is the difference of two large ones: the error of a path stays below 1 nm even a
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numba import njit
 
@@ -29,7 +27,9 @@ def _put(T: np.ndarray, S: np.ndarray, row: int, t_0: float, t_1: float, s_0: in
 
 
 @njit(cache=True, nogil=True)
-def _slab(o: float, d: float, h: float, face: int, lo: float, hi: float, s_lo: int, s_hi: int) -> Any:
+def _slab(
+    o: float, d: float, h: float, face: int, lo: float, hi: float, s_lo: int, s_hi: int
+) -> tuple[float, float, int, int]:
     """Cut the interval (lo, hi) with |o + t d| <= h; faces `face` (at -h) and `face` + 1 (at +h)."""
     if d == 0.0:
         if abs(o) > h:
@@ -131,19 +131,16 @@ def crossings(
     R: np.ndarray,
     c: np.ndarray,
     q: int,
-    ox: float,
-    oy: float,
-    oz: float,
-    dx: float,
-    dy: float,
-    dz: float,
+    o: tuple[float, float, float],
+    d: tuple[float, float, float],
     T: np.ndarray,
     S: np.ndarray,
     row: int,
 ) -> int:
     """Crossings of primitive q with the ray o + t d: into row `row` of T (distances) and S (faces); how many (even)."""
     # The ray's origin moves to the point nearest to the primitive's own origin; `shift` brings distances back.
-    ex, ey, ez = ox - c[q, 0], oy - c[q, 1], oz - c[q, 2]
+    dx, dy, dz = d
+    ex, ey, ez = o[0] - c[q, 0], o[1] - c[q, 1], o[2] - c[q, 2]
     shift = -(ex * dx + ey * dy + ez * dz)
     ex, ey, ez = ex + shift * dx, ey + shift * dy, ez + shift * dz
     n = 0

@@ -188,7 +188,7 @@ def _solid_crossings(
     for q in range(s.first[k], s.first[k + 1]):
         op = s.ops[q]
         if op >= 0:
-            n_now = crossings(s.kind, s.p, s.R, s.t, op, ox, oy, oz, dx, dy, dz, T, S, top)
+            n_now = crossings(s.kind, s.p, s.R, s.t, op, (ox, oy, oz), (dx, dy, dz), T, S, top)
             S[top, LARGEST] = n_now
             top += 1
             continue

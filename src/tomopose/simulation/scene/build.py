@@ -35,11 +35,13 @@ from tomopose.simulation.projector.focal_spot import FocalSpot, Motion
 from tomopose.simulation.run import SimulatedRun
 from tomopose.simulation.scene import scene as S
 from tomopose.units import Array
+from tomopose.values import require_types
 
 SETTLING, MACHINE = 11, 12
 """Streams of random numbers: how the drives stop, and which errors the machine has."""
 
 
+@require_types
 def simulate(scene: S.Scene, *, poses: PoseSequence | None = None) -> SimulatedRun:
     """The run that a scene describes; its images are made when they are asked for (`run.image(i)`).
 

@@ -30,6 +30,7 @@ from tomopose.simulation.physics.materials import MATERIALS, Material, from_form
 from tomopose.simulation.physics.spectrum import Spectrum, tube_spectrum
 from tomopose.simulation.projector.focal_spot import FWHM_PER_SIGMA, FocalSpot
 from tomopose.simulation.run import SimulatedRun
+from tomopose.values import require_types
 
 STEADY_MM, STEADY_PX = 1e-6, 1e-6
 """How far the intrinsic geometry may change from frame to frame; the virtual scanner's does not move."""
@@ -82,6 +83,7 @@ def _number(content: Any, *keys: str, default: float | None = None) -> float | N
     return float(entry["value"]) * scale[entry.get("unit")]
 
 
+@require_types
 def run_from_ctsimu(content: Mapping[str, Any], *, folder: str | Path = ".", seed: int = 0) -> SimulatedRun:
     """The run that a scenario's JSON content describes; files that it names are taken from `folder`.
 

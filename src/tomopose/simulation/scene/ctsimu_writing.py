@@ -19,11 +19,13 @@ from tomopose.simulation.physics.spectrum import Spectrum
 from tomopose.simulation.projector.focal_spot import FWHM_PER_SIGMA
 from tomopose.simulation.run import SimulatedRun
 from tomopose.simulation.scene.ctsimu import SIGMA_PER_RESOLUTION, STAGE_TO_M
+from tomopose.values import require_types
 
 ANODE_DENSITY = 10.0
 """g/cm3 of an anode whose material is not in the table: no spectrum depends on it."""
 
 
+@require_types
 def run_to_ctsimu(run: SimulatedRun) -> tuple[dict[str, Any], dict[str, TriangleMesh]]:
     """(scenario content, mesh files by name): geometry by the true poses, meshes in M, tessellated where analytic.
 

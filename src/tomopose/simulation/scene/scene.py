@@ -9,6 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from tomopose.errors import InputError
 from tomopose.reading import parse_toml, read_text, reader
+from tomopose.simulation.detector.detector import Detector
+from tomopose.simulation.detector.scatter_glare_mtf import Glare, Scatter
 
 SCHEMA = "tomopose/scene/1"
 Vector = tuple[float, float, float]
@@ -67,14 +69,14 @@ class SourcePart(Part):
 
 
 class ScatterPart(Part):
-    constant: float = 0.0
-    amount: float = 0.0
-    sigma_px: float = 100.0
+    constant: float = Scatter.constant
+    amount: float = Scatter.amount
+    sigma_px: float = Scatter.sigma
 
 
 class GlarePart(Part):
-    share: float = 0.0
-    sigma_px: float = 200.0
+    share: float = Glare.share
+    sigma_px: float = Glare.sigma
 
 
 class MTFPart(Part):
@@ -83,6 +85,8 @@ class MTFPart(Part):
 
 
 class DetectorPart(Part):
+    """The detector's own defaults, in the units of its keys."""
+
     scintillator: str = "CsI"
     thickness_mm: float = 0.6
     response: str | None = Field(
@@ -90,23 +94,23 @@ class DetectorPart(Part):
     )
     snr: float | None = None
     photons: float | None = None
-    averages: int = 1
-    blur_sigma_px: float = 0.7
+    averages: int = Detector.averages
+    blur_sigma_px: float = Detector.blur_sigma
     mtf: MTFPart | None = None
-    noise_sigma_px: float = 0.0
-    white: float = 45000.0
-    bits: int = 16
-    saturation: float | None = None
-    output: Literal["corrected", "raw"] = "corrected"
-    dark: float = 0.0
-    readout_noise: float = 0.0
-    gain_spread: float = 0.0
-    dark_spread: float = 0.0
-    dead_share: float = 0.0
-    flats: int = 50
-    falloff: bool = False
-    lag: tuple[float, ...] = ()
-    cells: int = 2
+    noise_sigma_px: float = Detector.noise_sigma
+    white: float = Detector.white
+    bits: int = Detector.bits
+    saturation: float | None = Detector.saturation
+    output: Literal["corrected", "raw"] = Detector.output
+    dark: float = Detector.dark
+    readout_noise: float = Detector.readout_noise
+    gain_spread: float = Detector.gain_spread
+    dark_spread: float = Detector.dark_spread
+    dead_share: float = Detector.dead_share
+    flats: int = Detector.flats
+    falloff: bool = Detector.falloff
+    lag: tuple[float, ...] = Detector.lag
+    cells: int = Detector.cells
     scatter: ScatterPart = ScatterPart()
     glare: GlarePart = GlarePart()
 
@@ -263,7 +267,7 @@ class Scene(Part):
         return self
 
 
-def scene_from(document: dict[str, Any], *, where: str = "scene", folder: str = "") -> Scene:
+def scene_from(document: dict[str, object], *, where: str = "scene", folder: str = "") -> Scene:
     """A scene from a document as TOML gives it; InputError names each key that cannot be used."""
     try:
         return Scene.model_validate({**document, "folder": folder})

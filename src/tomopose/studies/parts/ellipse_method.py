@@ -17,6 +17,7 @@ from scipy.ndimage import gaussian_filter, sobel
 
 from tomopose.errors import BallNotFoundError
 from tomopose.geometry.scanner import Scanner
+from tomopose.robust import MAD_TO_SIGMA
 from tomopose.units import Array
 
 SMOOTHING_PX = 1.4142
@@ -102,7 +103,7 @@ def ellipse_method(image: ArrayLike, scanner: Scanner, *, origin: tuple[int, int
         scale = np.sqrt(np.mean(X**2 + Y**2))
         centre, major, minor = centre_and_axes(fit_ellipse(X / scale, Y / scale))
         off = np.abs(np.hypot(X / scale - centre[0], Y / scale - centre[1]) - (major + minor) / 2)
-        keep = off < max(3.5 * 1.4826 * np.median(off), 1e-6)
+        keep = off < max(3.5 * MAD_TO_SIGMA * np.median(off), 1e-6)
         if keep.all():
             break
         x, y = x[keep], y[keep]

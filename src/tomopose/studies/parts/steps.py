@@ -58,7 +58,7 @@ class Steps:
     folder: Path | None = None
     key: Mapping[str, object] = field(default_factory=dict)
 
-    def of(self, name: str, compute: Callable[[], Mapping[str, Any]], **settings: object) -> dict[str, Any]:
+    def of(self, name: str, compute: Callable[[], Mapping[str, object]], **settings: object) -> dict[str, Any]:
         """The content of a step: kept from an earlier run with the same key and code, or computed (and kept) now.
 
         settings: what this step depends on beside the key of all steps, arrays and values whole.

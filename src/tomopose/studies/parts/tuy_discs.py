@@ -84,7 +84,7 @@ def disc_profile(scan: PoseSequence, scale: Scale) -> dict[str, Any]:
     return {"z": z, "x": x, "axis": values[:, core].mean(axis=1), "section": values[:, n // 2]}
 
 
-def wrongness(profile: Mapping[str, Any]) -> Array:
+def wrongness(profile: Mapping[str, object]) -> Array:
     """(DISCS,) rms of value less truth around each disc, within 10 mm of the axis, farther than AWAY from any face:
     what has been smeared into discs and gaps."""
     z, x, section = (np.asarray(profile[name]) for name in ("z", "x", "section"))
@@ -95,7 +95,7 @@ def wrongness(profile: Mapping[str, Any]) -> Array:
     return np.array([np.sqrt(np.mean(error[clear & (np.abs(z - h) < PITCH / 2)] ** 2)) for h in heights()])
 
 
-def rows_and_checks(found: Mapping[str, Mapping[str, Any]]) -> tuple[list[StudyRow], list[StudyCheck]]:
+def rows_and_checks(found: Mapping[str, Mapping[str, object]]) -> tuple[list[StudyRow], list[StudyCheck]]:
     """What is smeared around the outermost third of the discs and around the middle three, for both paths."""
     order = np.argsort(np.abs(heights()))
     rms = {name: wrongness(profile) for name, profile in found.items()}
@@ -131,7 +131,7 @@ def rows_and_checks(found: Mapping[str, Mapping[str, Any]]) -> tuple[list[StudyR
     ]
 
 
-def figures(found: Mapping[str, Mapping[str, Any]]) -> list[Figure]:
+def figures(found: Mapping[str, Mapping[str, object]]) -> list[Figure]:
     """Profiles along the axis, and a section through each volume."""
     lines = [
         {

@@ -21,6 +21,7 @@ from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
+from tomopose.values import require_types
 
 STEPS, START_STEPS = 60, 12
 TOLERANCE = 1e-10
@@ -38,6 +39,7 @@ class BallPose:
     chi2: float
 
 
+@require_types
 def pose_from_balls(
     scanner: Scanner, x_D: Any, balls: Any, *, covariance: Any = None, start: RigidTransform | None = None
 ) -> BallPose:

@@ -13,7 +13,7 @@ from numpy.testing import assert_array_equal
 from tomopose import BallObservations, PoseSequence, ProjectionMatrices, RigidTransform, Scanner, Volume, VoxelGrid
 from tomopose.errors import EngineMissingError, InputError
 from tomopose.geometry.frames import Frame
-from tomopose.values import equal, require
+from tomopose.values import equal
 
 ROWS = ("p0", "p1", "p2", "p3")
 
@@ -141,10 +141,3 @@ def test_without_pandas_the_install_line_is_named(monkeypatch):
     with pytest.raises(EngineMissingError) as caught:
         make_poses().to_dataframe()
     assert caught.value.install_line == "pip install pandas"
-
-
-def test_a_wrong_type_is_refused_by_the_name_of_the_argument():
-    with pytest.raises(InputError, match=r"^poses must be a PoseSequence; a str was given: read_poses\(path\) reads"):
-        require("poses", "poses.csv", PoseSequence, made_by="read_poses(path) reads one")
-    poses = make_poses()
-    assert require("poses", poses, PoseSequence, made_by="read_poses(path) reads one") is poses

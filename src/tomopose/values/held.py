@@ -199,17 +199,3 @@ def table(columns: Mapping[str, Column], index: Sequence[str], name: str) -> pan
     except ImportError as error:
         raise EngineMissingError("pandas is not installed", install_line="pip install pandas") from error
     return pandas.DataFrame(dict(columns), index=pandas.Index(index, name=name))
-
-
-def require(name: str, given: object, kind: type[T] | tuple[type[T], ...], *, made_by: str) -> T:
-    """The argument, if it is of that type.
-
-    Raises InputError that names the argument, what was given, and how one gets the right type:
-    `require("poses", poses, PoseSequence, made_by="read_poses(path) reads one")`.
-    """
-    kinds = kind if isinstance(kind, tuple) else (kind,)
-    if isinstance(given, kinds):
-        return given
-    wanted = " or ".join(k.__name__ for k in kinds)
-    article = "an" if type(given).__name__[:1].lower() in "aeiou" else "a"
-    raise InputError(f"{name} must be a {wanted}; {article} {type(given).__name__} was given: {made_by}")

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 
 from tomopose.errors import EngineMissingError, FileError, InputError
+from tomopose.io.images.formats.orientation import TURNS, UPRIGHT, upright
+from tomopose.io.images.formats.tiff_structure import require_sound_tiff
 from tomopose.io.images.frames import (
     Band,
     FrameSource,
@@ -23,8 +25,6 @@ from tomopose.io.images.frames import (
     require_one_kind,
     unreadable,
 )
-from tomopose.io.images.orientation import TURNS, UPRIGHT, upright
-from tomopose.io.images.tiff_structure import require_sound_tiff
 from tomopose.reading import reading
 
 ORIENTATION, DATE_TIME = 274, 306

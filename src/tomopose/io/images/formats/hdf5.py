@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from tomopose.errors import InputError
+from tomopose.io.images.formats.nexus import DATA, NexusValues, entries, stated_by
 from tomopose.io.images.frames import Band, Image, require_grey
-from tomopose.io.images.nexus import DATA, NexusValues, entries, stated_by
 from tomopose.io.images.stated import Stated
 from tomopose.reading import reading
 from tomopose.reading.hdf5 import checked_hdf5

@@ -61,7 +61,7 @@ def entries(nexus: Any) -> Iterator[Any]:
             yield entry
 
 
-def stated_by(entry: Any) -> Stated:
+def stated_by(entry: object) -> Stated:
     """Distances and pixel sizes of an entry, mm."""
     values = NexusValues(entry)
     source = values.length("instrument/source/distance", "instrument/SOURCE/distance")

@@ -1,0 +1,1 @@
+"""Image files, one format a file: frames by index, in the row order of the file."""
