@@ -137,7 +137,8 @@ class BallObservations(Rows):
     @property
     def sigma(self) -> Array:
         """(n, 2) standard uncertainties of u and v, px."""
-        return np.sqrt(np.einsum("nii->ni", self.covariance))
+        result: Array = np.sqrt(np.einsum("nii->ni", self.covariance))
+        return result
 
     def select(self, index: object) -> BallObservations:
         """The rows with those indices (or that mask or slice), in that order."""

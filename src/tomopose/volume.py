@@ -60,7 +60,8 @@ class VoxelGrid:
     @property
     def origin(self) -> Array:
         """Centre of voxel (0, 0, 0) in W, mm, (x, y, z)."""
-        return self.centre - self.spacing * (np.array(self.n_xyz) - 1) / 2
+        result: Array = self.centre - self.spacing * (np.array(self.n_xyz) - 1) / 2
+        return result
 
     @property
     def size(self) -> int:
@@ -82,11 +83,13 @@ class VoxelGrid:
 
     def points(self, index: ArrayLike) -> Array:
         """Centres (..., 3), mm in W, of voxels given by array indices (..., 3) as (iz, iy, ix); fractions allowed."""
-        return self.origin + self.spacing * np.asarray(index, dtype=np.float64)[..., ::-1]
+        result: Array = self.origin + self.spacing * np.asarray(index, dtype=np.float64)[..., ::-1]
+        return result
 
     def indices(self, x_W: ArrayLike) -> Array:
         """Fractional array indices (..., 3), (iz, iy, ix), of points (..., 3) in W, mm."""
-        return ((np.asarray(x_W, dtype=np.float64) - self.origin) / self.spacing)[..., ::-1]
+        result: Array = ((np.asarray(x_W, dtype=np.float64) - self.origin) / self.spacing)[..., ::-1]
+        return result
 
     def same_as(self, other: VoxelGrid) -> bool:
         """Whether both hold the same voxels, to a thousandth of one."""

@@ -210,7 +210,8 @@ class Calibration:
     @property
     def d(self) -> Array:
         """d_k (n,), px: distance between detected and calculated centre.  Eq. (8)."""
-        return np.linalg.norm(self.residuals, axis=1)
+        result: Array = np.linalg.norm(self.residuals, axis=1)
+        return result
 
     @property
     def d_rms(self) -> float:

@@ -61,7 +61,8 @@ def assumed_jacobian(solution: Solution, names: tuple[str, ...]) -> Array:
     J_s = blocks(p, solution.free, solution.fit).J_scanner
     columns = [SCANNER_COLUMNS.index("p_u" if n == "pitch_ratio" else n) for n in names]
     factor = np.array([p.scanner.p_v if n == "pitch_ratio" else 1.0 for n in names])
-    return J_s[:, :, columns] * factor
+    result: Array = J_s[:, :, columns] * factor
+    return result
 
 
 def _stated_chi2(solution: Solution, stated: Solution) -> float:

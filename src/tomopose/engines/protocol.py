@@ -97,7 +97,8 @@ def require_images(images: Any, views: Sequence[int], matrices: ProjectionMatric
     if images.shape != shape:
         raise InputError(f"images are {images.shape}; {shape} (views, n_v, n_u) are needed")
     require_views(views, len(matrices))
-    return images
+    result: np.ndarray = images
+    return result
 
 
 def require_support(support: object, grid: VoxelGrid) -> np.ndarray | None:
@@ -107,7 +108,8 @@ def require_support(support: object, grid: VoxelGrid) -> np.ndarray | None:
     support = np.asarray(support)
     if support.shape != grid.shape or support.dtype != np.bool_:
         raise InputError(f"the support is {support.dtype} {support.shape}; bool {grid.shape} (z, y, x) is needed")
-    return support
+    result: np.ndarray | None = support
+    return result
 
 
 def require_views(views: Sequence[int], n: int) -> None:
@@ -153,4 +155,5 @@ def box_lengths(P: Array, grid: VoxelGrid, n_u: int, n_v: int) -> np.ndarray:
     inside = (source > low) & (source < high)
     enter = np.where(d == 0, np.where(inside, -np.inf, np.inf), t.min(axis=0)).max(axis=-1)
     leave = np.where(d == 0, np.where(inside, np.inf, -np.inf), t.max(axis=0)).min(axis=-1)
-    return np.maximum(leave - np.maximum(enter, 0), 0) * np.linalg.norm(d, axis=-1)
+    result: np.ndarray = np.maximum(leave - np.maximum(enter, 0), 0) * np.linalg.norm(d, axis=-1)
+    return result

@@ -23,6 +23,8 @@ from numba.extending import intrinsic as untyped_intrinsic
 cgutils: Any = untyped_cgutils
 intrinsic: Callable[[Callable[..., object]], Callable[..., None]] = untyped_intrinsic
 
+tuple_of: Callable[[types.Type, int], types.Type] = types.UniTuple
+
 Context: TypeAlias = Any
 """numba's typing or code generation context, and what an intrinsic hands over: numba has no types for them."""
 Signature: TypeAlias = Any
@@ -231,7 +233,7 @@ def _back_block(inverse_square: bool) -> Block:
         `scale`, or scale / (w + l dw)^2.
         """
         signature = types.void(
-            column, types.int64, image, types.int64, types.int32, types.int32, types.UniTuple(types.float32, 7)
+            column, types.int64, image, types.int64, types.int32, types.int32, tuple_of(types.float32, 7)
         )
 
         def generate(context: Context, builder: ir.IRBuilder, signature: Signature, arguments: Arguments) -> ir.Value:
@@ -285,8 +287,8 @@ def forward_block(
         types.int64,
         types.int32,
         rays,
-        types.UniTuple(types.int64, 2),
-        types.UniTuple(types.float32, 3),
+        tuple_of(types.int64, 2),
+        tuple_of(types.float32, 3),
         sums,
     )
 

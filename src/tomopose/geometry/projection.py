@@ -56,7 +56,8 @@ def project_ball(
     x_H = (T_MH.R @ t[:, :, None])[..., 0] + T_MH.t
     x_T = T_HT.apply(x_H)
     x_W = (T_TW.R @ x_T[:, :, None])[..., 0] + T_TW.t
-    return project((scanner.P_S @ scanner.T_WS.matrix)[None], x_W)[0]
+    result: Array = project((scanner.P_S @ scanner.T_WS.matrix)[None], x_W)[0]
+    return result
 
 
 def eq5_matrices(
@@ -104,7 +105,8 @@ def canonical(P: ArrayLike, in_front: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
         raise InputError(f"view {np.flatnonzero(norm == 0)[0]}: the third row of P is zero; not a cone-beam projection")
     depth = P[..., 2, :3] @ np.asarray(in_front, dtype=np.float64) + P[..., 2, 3]
     sign = np.where(depth < 0, -1.0, 1.0)
-    return P * (sign / norm)[..., None, None]
+    result: Array = P * (sign / norm)[..., None, None]
+    return result
 
 
 @value
@@ -129,7 +131,8 @@ class ViewGeometry:
         n = np.cross(self.U, self.V)
         n /= np.linalg.norm(n, axis=-1, keepdims=True)
         sign = np.sign(np.einsum("ni,ni->n", n, self.centre - self.source))
-        return n * sign[:, None]
+        result: Array = n * sign[:, None]
+        return result
 
 
 def decompose(
@@ -176,7 +179,8 @@ def compose(source: ArrayLike, centre: ArrayLike, U: ArrayLike, V: ArrayLike, *,
     M = np.linalg.inv(np.stack([U, V, origin - source], axis=-1))
     P = np.concatenate([M, -M @ source[..., None]], axis=-1)
     # The depth axis must point from the source to the panel; its sign is known here without looking at the W origin.
-    return P / np.linalg.norm(P[:, 2, :3], axis=1)[:, None, None]
+    result: Array = P / np.linalg.norm(P[:, 2, :3], axis=1)[:, None, None]
+    return result
 
 
 def row_flip(n_v: int) -> Array:

@@ -87,7 +87,8 @@ def log_rotation(R: Array) -> Array:
 
 def rotation_angle_between(R_1: Array, R_2: Array) -> Array:
     """Angle (...,), rad, of the rotation that takes R_1 to R_2: the one honest way to compare rotations."""
-    return np.linalg.norm(log_rotation(np.swapaxes(R_1, -1, -2) @ R_2), axis=-1)
+    result: Array = np.linalg.norm(log_rotation(np.swapaxes(R_1, -1, -2) @ R_2), axis=-1)
+    return result
 
 
 def skew(x: Array) -> Array:

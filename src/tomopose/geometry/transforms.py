@@ -108,8 +108,10 @@ class RigidTransform:
         if self.R.ndim == 2:
             return x @ self.R.T + self.t
         if x.ndim == 1:
-            return self.R @ x + self.t
-        return np.einsum("nij,mj->nmi", self.R, x) + self.t[:, None, :]
+            result: Array = self.R @ x + self.t
+            return result
+        found: Array = np.einsum("nij,mj->nmi", self.R, x) + self.t[:, None, :]
+        return found
 
     def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> Array:
         return np.array(self.matrix, dtype=dtype)

@@ -87,7 +87,8 @@ class PoseMap:
     @property
     def sigma(self) -> Array:
         one = np.repeat([self.w_sigma, self.t_sigma], 3) / np.sqrt(len(self._terms))
-        return np.tile(one, len(self._terms)) * np.asarray(self.factors)[self.groups]
+        result: Array = np.tile(one, len(self._terms)) * np.asarray(self.factors)[self.groups]
+        return result
 
     def features(self, poses: PoseSequence) -> Array:
         """phi (n, terms)."""

@@ -100,7 +100,8 @@ def left_jacobian(w: Array) -> Array:
     W = np.zeros((*w.shape[:-1], 3, 3))
     W[..., 0, 1], W[..., 0, 2], W[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
     W -= np.swapaxes(W, -1, -2)
-    return np.eye(3) + a * W + b * (W @ W)
+    result: Array = np.eye(3) + a * W + b * (W @ W)
+    return result
 
 
 def moved(R: Array, t: Array, delta: Array) -> tuple[Array, Array]:

@@ -43,7 +43,8 @@ class ReferencePair:
     @property
     def apex(self) -> Array:
         """Apex (3,) of a reference cone: the axis point lies `distance` inside the surface, on the wide side."""
-        return self.point - self.direction * (self.distance / np.sin(self.apex_angle / 2))
+        result: Array = self.point - self.direction * (self.distance / np.sin(self.apex_angle / 2))
+        return result
 
 
 def reference_pairs(folder: str | Path) -> dict[str, Path]:

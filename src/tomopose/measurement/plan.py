@@ -197,7 +197,8 @@ class MeasurandPlan(_Strict):
         """The calibrated value, else the nominal one; mm or degrees."""
         unit = "deg" if self.kind in ANGLES else "mm"
         calibrated, nominal = (getattr(self, f"{k}_{unit}") for k in ("calibrated", "nominal"))
-        return nominal if calibrated is None else calibrated
+        result: float | None = nominal if calibrated is None else calibrated
+        return result
 
 
 class SpheresPlan(_Strict):

@@ -356,4 +356,5 @@ def _fewest(choose: Any, rms: Any, wanted: float, most: int, m: int) -> Chosen:
             high, design = middle, trial
         else:
             low = middle
-    return design
+    result: Chosen = design
+    return result

@@ -20,7 +20,8 @@ def move_times(poses: PoseSequence, limits: PlanLimits) -> Array:
     n = len(poses)
     turn = rotation_angle_between(np.repeat(T.R, n, axis=0), np.tile(T.R, (n, 1, 1))).reshape(n, n) / limits.turn_speed
     table = np.abs(alpha[:, None] - alpha[None]) / limits.table_speed
-    return limits.settle + np.maximum(np.maximum(way, turn), table)
+    result: Array = limits.settle + np.maximum(np.maximum(way, turn), table)
+    return result
 
 
 def short_tour(cost: Array, start: int = 0) -> Array:

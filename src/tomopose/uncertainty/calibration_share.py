@@ -76,4 +76,5 @@ def _some(feature: Feature) -> Array:
 def _quadratic(x: Array) -> Array:
     """(n, 27) weights of the nodes at places x (n, 3) between -1 and 1: products of Lagrange's parabolas."""
     one = np.stack([0.5 * x * (x - 1), 1 - x**2, 0.5 * x * (x + 1)], axis=-1)
-    return np.einsum("ni,nj,nk->nijk", one[:, 0], one[:, 1], one[:, 2]).reshape(len(x), -1)
+    result: Array = np.einsum("ni,nj,nk->nijk", one[:, 0], one[:, 1], one[:, 2]).reshape(len(x), -1)
+    return result

@@ -55,6 +55,7 @@ MILLIMETRES = ("ball_diameter", "d_SD", "radius", "spacing")
 
 Test = Callable[[object], bool]
 ARRAY_LIKE = typing.get_args(ArrayLike)
+CALLABLE: object = Callable
 
 
 def require(name: str, given: object, kind: type[T] | tuple[type[T], ...], *, made_by: str | None = None) -> T:
@@ -146,7 +147,7 @@ def _test_of_one(hint: object) -> Test | None:
         return _may_be_numbers
     if kind is bool or _is_ours(kind):
         return lambda value: isinstance(value, kind)
-    if kind is Callable:
+    if kind is CALLABLE:
         return callable
     if issubclass(kind, Mapping) and len(parts) == 2:
         return _each(_test(parts[1]) or (lambda value: True), Mapping)
@@ -169,7 +170,7 @@ def _words(hint: object) -> Iterable[str]:
             yield "number"
         elif kind is np.ndarray or (inner and inner[0] in (int, float)):
             yield "array of numbers"
-        elif kind is Callable:
+        elif kind is CALLABLE:
             yield "function"
         elif kind is Iterable:
             yield "sequence"

@@ -362,7 +362,8 @@ class _Declared:
         return replace(self.own, chi2=chi2)
 
     def dof(self, problem: Problem) -> int:
-        return 2 * len(problem) + self.n_prior - self.fit.N.shape[0]
+        result: int = 2 * len(problem) + self.n_prior - self.fit.N.shape[0]
+        return result
 
     def sigmas(self) -> float:
         """What the declared reading leaves, beside what moved where that is much."""

@@ -94,7 +94,8 @@ def elapsed(problem: Problem) -> Array:
         except ValueError:
             t = np.zeros(0)
         if t.size and np.ptp(t) > 0:
-            return t - t.min()
+            result: Array = t - t.min()
+            return result
     return np.arange(len(problem), dtype=np.float64)
 
 

@@ -58,7 +58,8 @@ def slacks(estimate: MapEstimate) -> Array:
     """(n, 6): the most probable own motion (w, t) of each pose, rad and mm, in H."""
     problem, at = estimate.problem, estimate.at
     V = problem.scatter * problem.repeatability.variance
-    return V * np.einsum("nia,ni->na", at.J_pose, np.linalg.solve(at.C, at.r[:, :, None])[..., 0])
+    result: Array = V * np.einsum("nia,ni->na", at.J_pose, np.linalg.solve(at.C, at.r[:, :, None])[..., 0])
+    return result
 
 
 def determined_turns(estimate: MapEstimate) -> str:

@@ -22,7 +22,8 @@ def inverse_information(N: Array) -> Array:
     value, V = np.linalg.eigh(N * scale[:, None] * scale)
     V = scale[:, None] * V
     C = (V / np.maximum(value, 1e-15)) @ V.T
-    return (C + C.T) / 2
+    result: Array = (C + C.T) / 2
+    return result
 
 
 def significant(chi2: float, dof: int) -> bool:

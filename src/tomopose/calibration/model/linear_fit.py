@@ -57,7 +57,8 @@ class LinearFit:
     def J_ball(self) -> Array:
         """(n, 2, 3) by the centre of the row's own ball."""
         n, balls = len(self.J), len(self.problem.ball_ids)
-        return self.J[:, :, 6 : 6 + 3 * balls].reshape(n, 2, balls, 3).sum(axis=2)
+        result: Array = self.J[:, :, 6 : 6 + 3 * balls].reshape(n, 2, balls, 3).sum(axis=2)
+        return result
 
     @cached_property
     def rows(self) -> Array:

@@ -136,7 +136,8 @@ def twin_view_matrices(
     T_HS = scanner.T_WS @ scanner.T_TW(0.0) @ T_HT
     R = T_HS.R @ real.R
     t = real.t @ T_HS.R.T + T_HS.t - spot
-    return K @ np.concatenate([R, t[:, :, None]], axis=2)
+    result: Array = K @ np.concatenate([R, t[:, :, None]], axis=2)
+    return result
 
 
 def balls_from_rays(P: Array, x_D: Array, ball: Array, count: int) -> Array:

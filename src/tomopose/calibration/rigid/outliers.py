@@ -69,7 +69,8 @@ def studentised(problem: Problem, free: FreeParameters, fit: Fit, keep: Any) -> 
     # a row that the fit follows entirely has no residual of its own: floor at one per cent of its covariance
     value, Q = np.linalg.eigh(problem.W @ V @ np.swapaxes(problem.W, 1, 2))
     z = (np.swapaxes(Q, 1, 2) @ (problem.W @ r[:, :, None]))[..., 0]
-    return (z**2 / np.maximum(value, 0.01)).sum(axis=1)
+    result: Array = (z**2 / np.maximum(value, 0.01)).sum(axis=1)
+    return result
 
 
 def _scale(distance2: Array) -> float:

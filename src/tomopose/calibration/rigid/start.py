@@ -59,7 +59,8 @@ def _solve(N: Array, g: Array) -> Array:
     value, V = np.linalg.eigh(N * scale[:, None] * scale)
     good = value > RANK_TOLERANCE * value[-1]
     V = V[:, good]
-    return scale * (V @ ((V.T @ (scale * g)) / value[good]))
+    result: Array = scale * (V @ ((V.T @ (scale * g)) / value[good]))
+    return result
 
 
 def positions_for(problem: Problem, R_HT: Array, rays: Rays) -> tuple[Array, Array]:
@@ -103,7 +104,8 @@ def resection(problem: Problem, t: Array, rays: Rays) -> Array:
     B = x[:9].reshape(3, 3)
     U, _, V = np.linalg.svd(-B if np.linalg.det(B) < 0 else B)
     # of (nearly) flat data the sign of det may still be lost
-    return U @ V if np.linalg.det(U @ V) > 0 else U @ np.diag([1.0, 1.0, -1.0]) @ V
+    result: Array = U @ V if np.linalg.det(U @ V) > 0 else U @ np.diag([1.0, 1.0, -1.0]) @ V
+    return result
 
 
 def closed_form(problem: Problem, rays: Rays) -> tuple[Array, Array, Array]:

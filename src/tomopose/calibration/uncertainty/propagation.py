@@ -75,7 +75,8 @@ def matrix_point_sigma(calibration: Calibration, poses: PoseSequence, x_W: Array
     """(n, m) px: predicted standard uncertainty (root of the mean of the two variances) of points x_W (m, 3) in W."""
     J = matrix_point_jacobian(calibration, poses, np.asarray(x_W, dtype=np.float64))
     V = np.einsum("nmic,cd,nmid->nmi", J, calibration.covariance, J)
-    return np.sqrt(np.maximum(V.mean(axis=2), 0.0))
+    result: Array = np.sqrt(np.maximum(V.mean(axis=2), 0.0))
+    return result
 
 
 def tilt_sigma(calibration: Calibration, tilt: float = TILT) -> float:
@@ -105,7 +106,8 @@ def apparent_displacement(calibration: Calibration, poses: PoseSequence, x_W: Ar
 def object_sigma(calibration: Calibration, poses: PoseSequence, x_W: ArrayLike) -> Array:
     """(m, 3) mm: standard uncertainty of each coordinate of points x_W (m, 3) in a reconstruction of this scan."""
     B = apparent_displacement(calibration, poses, x_W)
-    return np.sqrt(np.einsum("mac,cd,mad->ma", B, calibration.covariance, B))
+    result: Array = np.sqrt(np.einsum("mac,cd,mad->ma", B, calibration.covariance, B))
+    return result
 
 
 def scan_displacement(calibration: Calibration, poses: PoseSequence, x_W: ArrayLike) -> tuple[Array, Array]:

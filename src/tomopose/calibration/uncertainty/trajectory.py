@@ -32,14 +32,16 @@ def point_jacobian(P: Array, x: Array) -> Array:
     """d(u, v)/dx (n, m, 2, 3) of points x (m, 3) under matrices P (n, 3, 4)."""
     h = np.einsum("nij,mj->nmi", P[:, :, :3], x) + P[:, None, :, 3]
     w = h[..., 2:]
-    return (P[:, None, :2, :3] - (h[..., :2] / w)[..., None] * P[:, None, 2:, :3]) / w[..., None]
+    result: Array = (P[:, None, :2, :3] - (h[..., :2] / w)[..., None] * P[:, None, 2:, :3]) / w[..., None]
+    return result
 
 
 def pixels(P: Array, x: Array) -> Array:
     """Pixels (n, m, 2) of points x (m, 3), whatever the sign of P: the W origin of a robot's home may lie behind the
     source, and `canonical` then turns the sign of w for the object."""
     h = np.einsum("nij,mj->nmi", P[:, :, :3], x) + P[:, None, :, 3]
-    return h[..., :2] / h[..., 2:]
+    result: Array = h[..., :2] / h[..., 2:]
+    return result
 
 
 def without_object_pose(P: ArrayLike, P_true: ArrayLike, points: ArrayLike) -> Array:

@@ -76,4 +76,5 @@ def nominal_radius_is_off(rows: list[Row], expected: float, ball_diameter: float
             f"ball_diameter = {ball_diameter:g} mm has on the rotation axis; d_SD, d_SR, a pixel pitch or the diameter "
             "is wrong"
         )
-    return off > settings.off
+    result: bool = off > settings.off
+    return result

@@ -114,7 +114,8 @@ class Feature:
 
     @property
     def used_residuals(self) -> Array:
-        return self.residuals[self.used]
+        result: Array = self.residuals[self.used]
+        return result
 
     @property
     def rms(self) -> float:

@@ -237,7 +237,8 @@ def feature_distances(kind: str, vector: Array, points: Array) -> Array:
     if kind == "plane":
         return (points - point) @ direction
     if kind == "line":
-        return np.linalg.norm(np.cross(points - point, direction), axis=1)
+        result: Array = np.linalg.norm(np.cross(points - point, direction), axis=1)
+        return result
     shape_kind = "sphere" if kind == "calotte" else kind
     frame = np.eye(3) if shape_kind == "sphere" else frame_along(direction)
     psi = float(vector[7]) if kind == "cone" else 0.0
@@ -250,7 +251,8 @@ def _vector(point: Array, direction: npt.ArrayLike = np.nan, radius: float = np.
 
 def _sense(direction: Array) -> Array:
     """The direction or its opposite, so that the largest component is positive."""
-    return direction * np.sign(direction[int(np.argmax(np.abs(direction)))])
+    result: Array = direction * np.sign(direction[int(np.argmax(np.abs(direction)))])
+    return result
 
 
 def _centroid_frame(points: Array, sigma: Array) -> tuple[Array, Array, Array]:

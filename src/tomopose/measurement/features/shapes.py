@@ -45,10 +45,12 @@ def distances(shape: Shape, points: Array) -> Array:
     """(n,) signed orthogonal distances, positive outside."""
     y = (points - shape.point) @ shape.frame.T
     if shape.kind == "sphere":
-        return np.linalg.norm(y, axis=1) - shape.radius
+        result: Array = np.linalg.norm(y, axis=1) - shape.radius
+        return result
     rho = np.hypot(y[:, 0], y[:, 1])
     if shape.kind == "cone":
-        return (rho - shape.radius) * np.cos(shape.psi) - y[:, 2] * np.sin(shape.psi)
+        found: Array = (rho - shape.radius) * np.cos(shape.psi) - y[:, 2] * np.sin(shape.psi)
+        return found
     return rho - shape.radius
 
 

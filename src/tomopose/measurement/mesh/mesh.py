@@ -45,7 +45,8 @@ class Mesh:
     @cached_property
     def _unit_face_normals(self) -> Array:
         n = self.face_normals
-        return n / np.maximum(np.linalg.norm(n, axis=1), 1e-300)[:, None]
+        result: Array = n / np.maximum(np.linalg.norm(n, axis=1), 1e-300)[:, None]
+        return result
 
     @cached_property
     def normals(self) -> Array:
@@ -57,7 +58,8 @@ class Mesh:
             angle = np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), np.einsum("ij,ij->i", u, v))
             for a in range(3):
                 out[:, a] += np.bincount(self.faces[:, k], weights=angle * n[:, a], minlength=len(out))
-        return out / np.maximum(np.linalg.norm(out, axis=1), 1e-300)[:, None]
+        result: Array = out / np.maximum(np.linalg.norm(out, axis=1), 1e-300)[:, None]
+        return result
 
     @cached_property
     def _edges(self) -> tuple[np.ndarray, np.ndarray]:

@@ -197,9 +197,10 @@ def _piece(
         return np.full((len(index), kernel.N_COLUMNS), np.nan), np.full(len(index), kernel.BORDER, dtype=np.uint8)
     part = volume.values[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
     coefficients = spline_coefficients(part)
-    return kernel.search_lines(
+    result: tuple[Array, np.ndarray] = kernel.search_lines(
         coefficients, index - low, step, sigma, window, settings.search_distance, settings.method == "esf", longer
     )
+    return result
 
 
 def _part(index: Array, reach: Array, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:

@@ -85,7 +85,8 @@ class Surface:
         a, b, c = (self.points[self.faces[:, k]] for k in range(3))
         third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
         area = np.bincount(self.faces.ravel(), np.repeat(third, 3), minlength=len(self))
-        return np.maximum(area, LEAST_AREA * area.mean())
+        result: Array = np.maximum(area, LEAST_AREA * area.mean())
+        return result
 
 
 @require_types

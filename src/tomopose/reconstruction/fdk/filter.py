@@ -113,7 +113,8 @@ class FdkFilter:
         a = (np.arange(self._n[0]) - self._rays.u_0[j]) * self._p[0]
         b = (np.arange(self._n[1]) - self._rays.v_0[j]) * self._p[1]
         d = self._rays.d_SD[j]
-        return d / np.sqrt(d**2 + a**2 + b[:, None] ** 2)
+        result: Array = d / np.sqrt(d**2 + a**2 + b[:, None] ** 2)
+        return result
 
     def along_rows(self, image: np.ndarray) -> np.ndarray:
         """The ramp along u."""

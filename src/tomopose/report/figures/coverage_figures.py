@@ -181,7 +181,8 @@ def correlation(covariance: ArrayLike) -> Array:
     covariance = np.asarray(covariance, dtype=np.float64)
     variance = np.diag(covariance)
     sigma = np.sqrt(np.where(variance > 0, variance, np.nan))
-    return covariance / np.outer(sigma, sigma)
+    result: Array = covariance / np.outer(sigma, sigma)
+    return result
 
 
 def correlation_map(calibration: Calibration) -> Figure:

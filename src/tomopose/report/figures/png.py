@@ -27,7 +27,8 @@ def grey_levels(image: ArrayLike, *, low: float = 0.5, high: float = 99.5) -> np
     bottom, top = np.percentile(image[finite], [low, high])
     span = top - bottom if top > bottom else 1.0
     scaled = np.clip((np.where(finite, image, bottom) - bottom) / span, 0.0, 1.0)
-    return np.round(255.0 * scaled).astype(np.uint8)
+    result: np.ndarray = np.round(255.0 * scaled).astype(np.uint8)
+    return result
 
 
 def grey_png(rows: np.ndarray) -> bytes:

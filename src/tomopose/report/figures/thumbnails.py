@@ -55,11 +55,12 @@ def ellipse_outline(centre: ArrayLike, semi_major: float, semi_minor: float, ang
     phase = np.linspace(0.0, 2.0 * np.pi, OUTLINE_POINTS)
     major = np.array([np.cos(angle), np.sin(angle)])
     minor = np.array([-major[1], major[0]])
-    return (
+    result: Array = (
         np.asarray(centre, dtype=np.float64)
         + semi_major * np.cos(phase)[:, None] * major
         + semi_minor * np.sin(phase)[:, None] * minor
     )
+    return result
 
 
 def thumbnail(observations: BallObservations, k: int, image: ArrayLike, *, text: str = "") -> Thumbnail:

@@ -56,7 +56,8 @@ def _few(key: np.uint64, n: int, mean: float) -> float:
 def _quanta(key: np.uint64, n: int, mean: float, z: float) -> float:
     if mean < FEW:
         return _few(key, n, mean) if mean > 0 else 0.0
-    return mean + np.sqrt(mean) * z + (z * z - 1) / 6
+    result: float = mean + np.sqrt(mean) * z + (z * z - 1) / 6
+    return result
 
 
 @njit(cache=True, nogil=True)

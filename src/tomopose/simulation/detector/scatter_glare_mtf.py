@@ -130,7 +130,8 @@ class MTF:
 
     def at(self, f: Array) -> Array:
         last = self.frequency[-1] + (self.frequency[-1] - self.frequency[-2])
-        return np.interp(f, np.append(self.frequency, last), np.append(self.value, 0.0))
+        result: Array = np.interp(f, np.append(self.frequency, last), np.append(self.value, 0.0))
+        return result
 
 
 def with_mtf(T: Array, mtf: MTF, border: int = 32) -> Array:

@@ -110,7 +110,8 @@ class MeshSolid:
     def tracer(self) -> Tracer:
         if "tracer" not in self._cache:
             self._cache["tracer"] = Tracer(self.mesh)
-        return self._cache["tracer"]
+        result: Tracer = self._cache["tracer"]
+        return result
 
 
 def _mesh_solid(mesh: TriangleMesh, material: str, frame: Frame, name: str) -> MeshSolid:

@@ -216,7 +216,8 @@ def _misses(s: SolidArrays, k: int, ox: float, oy: float, oz: float, dx: float, 
     """Whether a ray passes the bounding sphere of solid k."""
     ex, ey, ez = s.centre[k, 0] - ox, s.centre[k, 1] - oy, s.centre[k, 2] - oz
     along = ex * dx + ey * dy + ez * dz
-    return ex * ex + ey * ey + ez * ez - along * along >= s.radius[k] * s.radius[k] * (1 + 1e-9) + 1e-9
+    result: bool = ex * ex + ey * ey + ez * ez - along * along >= s.radius[k] * s.radius[k] * (1 + 1e-9) + 1e-9
+    return result
 
 
 @njit(cache=True, nogil=True)

@@ -49,7 +49,8 @@ def disc_integrals(P: Array, scanner: Scanner, faces: Sequence[tuple[float, floa
         lowered = P.copy()
         lowered[1] -= part * P[2]
         rows.append(cylinder_integrals(lowered, scanner, radius=RADIUS, ends=faces))
-    return np.mean(rows, axis=0).astype(np.float32)
+    result: np.ndarray = np.mean(rows, axis=0).astype(np.float32)
+    return result
 
 
 def disc_profile(scan: PoseSequence, scale: Scale) -> dict[str, Any]:

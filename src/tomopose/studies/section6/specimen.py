@@ -94,7 +94,8 @@ def cuboid_areas(mesh: Mesh) -> np.ndarray:
     for name, plan in plan_for(Alignment.none()).features.items():
         if name.startswith("cuboid"):
             out |= surface_region(plan, Alignment.none(), mesh.points, mesh.normals)
-    return out & ~mesh.on_edge
+    result: np.ndarray = out & ~mesh.on_edge
+    return result
 
 
 def unseen_by_circle(mesh: Mesh, source: Array) -> np.ndarray:
