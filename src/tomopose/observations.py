@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -110,7 +111,9 @@ class BallObservations(Rows):
                 object.__setattr__(self, name, array)
 
     @classmethod
-    def from_sigma(cls, x_D: ArrayLike, sigma: ArrayLike, *, pose_id: Any = None, **columns: Any) -> BallObservations:
+    def from_sigma(
+        cls, x_D: ArrayLike, sigma: ArrayLike, *, pose_id: Iterable[object] | None = None, **columns: Any
+    ) -> BallObservations:
         """From centres (n, 2) and standard uncertainties (a number, (n,) or (n, 2)), px, without correlation."""
         x_D = np.asarray(x_D, dtype=np.float64)
         s = np.asarray(sigma, dtype=np.float64)

@@ -146,7 +146,7 @@ class Volume:
         """Whether the volume contradicts none of the views that it was made from."""
         return not self.contradicted
 
-    def slices(self, at: Any = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def slices(self, at: ArrayLike | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Three orthogonal slices through voxel `at` (iz, iy, ix), the middle unless given: [y, x], [z, x], [z, y]."""
         iz, iy, ix = (n // 2 for n in self.grid.shape) if at is None else (int(i) for i in at)
         if not all(0 <= i < n for i, n in zip((iz, iy, ix), self.grid.shape, strict=True)):

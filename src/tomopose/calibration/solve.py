@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 
@@ -39,7 +39,7 @@ from tomopose.geometry.rotations import rotation_angle_between
 from tomopose.geometry.scanner import Scanner
 from tomopose.manipulator.error_models import PoseScatter, RigidErrors
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.manipulator.real_poses import Repeatability
+from tomopose.manipulator.real_poses import ErrorModel, Repeatability
 from tomopose.observations import BallObservations
 from tomopose.provenance import provenance
 from tomopose.units import Array
@@ -193,14 +193,14 @@ def calibrate(
     poses: PoseSequence | Sequence[PoseSequence],
     observations: BallObservations | Sequence[BallObservations],
     *,
-    manipulator: Any = None,
+    manipulator: ErrorModel | str | Path | Mapping[str, object] | None = None,
     model: str = "auto",
     free: str | Sequence[str] = "auto",
     fix: Sequence[str] = (),
     priors: Mapping[str, float] | None = None,
     robust: bool = True,
     hypotheses: bool | Sequence[Alternative] = True,
-    pose_noise: Any = "auto",
+    pose_noise: str | tuple[float, float] | None = "auto",
     repeatability: Repeatability | None = None,
     distances: Mapping[tuple[int, int], tuple[float, float]] | None = None,
     raise_on_failure: bool = True,
@@ -293,7 +293,9 @@ def freed_names(free: str | Sequence[str]) -> tuple[tuple[str, ...], bool]:
     return tuple(free), not free
 
 
-def maker_of(manipulator: Any, stated: Repeatability | None) -> Repeatability | None:
+def maker_of(
+    manipulator: ErrorModel | str | Path | Mapping[str, object] | None, stated: Repeatability | None
+) -> Repeatability | None:
     """The maker's repeatability: as stated, else as the manipulator's file says; None: not known."""
     if stated is not None or manipulator is None:
         return stated

@@ -17,6 +17,8 @@ RAW = re.compile(r"(?P<n_v>\d+)x(?P<n_u>\d+):(?P<dtype>[^:]+)(:(?P<header>\d+))?
 
 if TYPE_CHECKING:
     from tomopose import BallObservations, Calibration, PoseSequence, ProjectionMatrices, Scanner
+    from tomopose.io.images.sequence import ImageSequence
+    from tomopose.manipulator.real_poses import ErrorModel
     from tomopose.report.figures.thumbnails import Thumbnail
 
 
@@ -65,7 +67,7 @@ def open_for(
     return images if poses is None else images.select(tp.pair_images(poses, images))
 
 
-def forward_of(machine: Any) -> Any:
+def forward_of(machine: ErrorModel | None) -> Any:
     """The forward kinematics of a robot with joint values, for tables that hold nothing else."""
     return machine.forward if hasattr(machine, "joints") else None
 
@@ -107,7 +109,7 @@ def require_free_folder(out: Path, *, force: bool) -> None:
 def observe(
     say: Say,
     scanner: Scanner,
-    images: Any,
+    images: ImageSequence,
     poses: PoseSequence | None,
     *,
     ball_diameter: float | Mapping[int, float] | None,
@@ -128,7 +130,7 @@ def observe(
     return replace(found, image=tuple(Path(name).name for name in images.names), ball_diameter=only)
 
 
-def worst(calibration: Calibration, observations: BallObservations, images: Any) -> tuple[Thumbnail, ...]:
+def worst(calibration: Calibration, observations: BallObservations, images: ImageSequence) -> tuple[Thumbnail, ...]:
     """Pictures of the images that deserve a look: those not measured first, then the largest residuals."""
     from tomopose.report import worst_thumbnails
 
@@ -142,7 +144,7 @@ def write_calibration_folder(
     observations: BallObservations,
     poses: PoseSequence,
     *,
-    images: Any = None,
+    images: ImageSequence | None = None,
     scan: ProjectionMatrices | None = None,
     force: bool = False,
 ) -> None:

@@ -13,6 +13,7 @@ from tomopose.cli.options import WritingOptions, add_command
 
 if TYPE_CHECKING:
     from tomopose import Calibration, PoseSequence, ProjectionMatrices
+    from tomopose.manipulator.real_poses import ErrorModel
 
 EPILOG = (
     "Example: tomopose matrices --calibration cal/calibration.json --poses scan.csv --binning 2 --out matrices.npz\n\n"
@@ -88,7 +89,7 @@ def machines(o: Options, cal: Calibration) -> tuple[Any, Any]:
 
 
 def matrices_of(
-    o: Options, cal: Calibration, machine: Any, other: Any
+    o: Options, cal: Calibration, machine: ErrorModel | None, other: ErrorModel | None
 ) -> tuple[ProjectionMatrices, tuple[str, ...], PoseSequence | None]:
     """(matrices, remarks, poses to command for them, where --commands asks for those)."""
     import tomopose as tp

@@ -14,6 +14,7 @@ from tomopose.cli.options import WritingOptions
 
 if TYPE_CHECKING:
     from tomopose import PoseSequence, Scanner
+    from tomopose.manipulator.real_poses import ErrorModel
     from tomopose.planning.identified_design import KinematicPlan as IdentifiedPlan
     from tomopose.planning.limits import PlanLimits
 
@@ -127,7 +128,7 @@ class Planned:
     lines: tuple[str, ...] = ()
 
 
-def identified_plan(o: Options, scanner: Scanner, machine: Any) -> IdentifiedPlan:
+def identified_plan(o: Options, scanner: Scanner, machine: ErrorModel) -> IdentifiedPlan:
     """The plan that determines what a tilted scan needs of the manipulator's own errors."""
     import numpy as np
 

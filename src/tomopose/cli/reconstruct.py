@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from tomopose import Correction, Volume, VoxelGrid
+    from tomopose.io.images.sequence import Rows
     from tomopose.reconstruction.settings import Algorithm
 
 EPILOG = (
@@ -208,7 +209,7 @@ def algorithm_from(o: AlgorithmOptions) -> Algorithm | None:
     return with_options(asked, given)
 
 
-def correction_from(o: Options, rows: Any) -> Correction:
+def correction_from(o: Options, rows: Rows) -> Correction:
     """How the images become line integrals; rows: the order of rows that the images were opened with."""
     import tomopose as tp
 

@@ -8,15 +8,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from tomopose.cli.common import Progress
 
 if TYPE_CHECKING:
+    from dask.distributed import Client
+
     from tomopose.kept import Key
+    from tomopose.simulation.run import SimulatedRun
+    from tomopose.simulation.scene.scene import Scene
 
 RADIOGRAPHS, STACK = "radiographs", "radiographs.h5"
 
 
-def run_of(scene: Any, path: Path) -> Any:
+def run_of(scene: Scene, path: Path) -> Any:
     """The run of the scene that was read from that path, its poses from the table that it names, if it names one."""
     import tomopose as tp
 
@@ -29,7 +35,9 @@ def image_names(pose_ids: Iterable[str]) -> list[str]:
     return [f"pose_{k:04d}.tif" for k, _ in enumerate(pose_ids)]
 
 
-def frames(run: Any, wanted: Sequence[int], *, workers: int = 1, client: Any = None) -> Iterator[tuple[int, Any]]:
+def frames(
+    run: SimulatedRun, wanted: Sequence[int], *, workers: int = 1, client: Client | None = None
+) -> Iterator[tuple[int, Any]]:
     """(number, image) of the wanted frames, in order, made by threads here or by a dask client's workers."""
     from tomopose.detection.run.executors import ordered_map
 
@@ -46,18 +54,18 @@ def frames(run: Any, wanted: Sequence[int], *, workers: int = 1, client: Any = N
             yield k, image
 
 
-def _image(run: Any, k: int) -> Any:
+def _image(run: SimulatedRun, k: int) -> Any:
     return run.image(k)
 
 
 def write_run(
     out: Path,
-    run: Any,
+    run: SimulatedRun,
     *,
     inputs: Iterable[Path] = (),
     form: str = "tiff",
     workers: int = 1,
-    client: Any = None,
+    client: Client | None = None,
     resume: bool = False,
     force: bool = False,
     progress: Progress | None = None,
@@ -79,12 +87,12 @@ def write_run(
 
 def _write_run(
     out: Path,
-    run: Any,
+    run: SimulatedRun,
     *,
     inputs: Iterable[Path],
     form: str,
     workers: int,
-    client: Any,
+    client: Client | None,
     resume: bool,
     force: bool,
     told: Progress,
@@ -157,7 +165,7 @@ def clear_another_run(out: Path, key: Key, *, force: bool) -> None:
     remove_stack(stack)
 
 
-def _told(made: Iterator[tuple[int, Any]], done: int, n: int, told: Progress) -> Iterator[tuple[int, Any]]:
+def _told(made: Iterator[tuple[int, np.ndarray]], done: int, n: int, told: Progress) -> Iterator[tuple[int, Any]]:
     """The same frames; each is reported once the next is asked for, when it is written."""
     for finished, frame in enumerate(made, start=done + 1):
         yield frame

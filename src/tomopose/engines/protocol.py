@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.errors import EngineFailedError, InputError
 from tomopose.geometry.projection import ProjectionMatrices
@@ -90,7 +91,7 @@ class Engine(Protocol):
         """(m, n_v, n_u), mm: the length of each pixel's ray inside the grid's box: A 1 to within half a voxel."""
 
 
-def require_images(images: Any, views: Sequence[int], matrices: ProjectionMatrices) -> np.ndarray:
+def require_images(images: ArrayLike, views: Sequence[int], matrices: ProjectionMatrices) -> np.ndarray:
     """The images as float32 (m, n_v, n_u), one for each view."""
     images = np.asarray(images, dtype=np.float32)
     shape = (len(views), matrices.n_v, matrices.n_u)

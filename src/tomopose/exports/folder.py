@@ -267,7 +267,9 @@ def _entry(f: Format, folder: Path, files: Sequence[str], m: ProjectionMatrices,
     return {"row0": row0, **note, "files": sums, "contents": f.contents, "load": f.load}
 
 
-def _manifest(m: ProjectionMatrices, entries: Any, refused: Any, made: Provenance) -> dict[str, Any]:
+def _manifest(
+    m: ProjectionMatrices, entries: Mapping[str, object], refused: Mapping[str, object], made: Provenance
+) -> dict[str, Any]:
     return {
         "about": ABOUT,
         "n_views": len(m),

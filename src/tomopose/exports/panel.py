@@ -79,13 +79,13 @@ class Given:
                 )
         return found
 
-    def matrices(self, P: Any, *, n_u: int, n_v: int, p_u: float, p_v: float) -> ProjectionMatrices:
+    def matrices(self, P: Array, *, n_u: int, n_v: int, p_u: float, p_v: float) -> ProjectionMatrices:
         """The result of a reader, with the views' names where they are known, 0 ... n-1 otherwise."""
         names = self.pose_id or tuple(str(k) for k in range(len(P)))
         return ProjectionMatrices(P=P, n_u=n_u, n_v=n_v, p_u=p_u, p_v=p_v, pose_id=names)
 
 
-def _require_sensible(name: str, value: Any, source: str) -> None:
+def _require_sensible(name: str, value: float | None, source: str) -> None:
     """InputError for a size that is no positive whole number and a pitch that is no positive number."""
     if value is None:
         return
@@ -169,7 +169,7 @@ def one_pitch(lengths: Array, what: str, where: str) -> float:
     return float(np.median(lengths))
 
 
-def require_keys(content: Any, keys: Sequence[str], where: str) -> None:
+def require_keys(content: Mapping[str, object], keys: Sequence[str], where: str) -> None:
     """InputError names the keys that a file lacks, and those it has instead."""
     missing = [k for k in keys if k not in content]
     if missing:

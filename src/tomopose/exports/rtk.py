@@ -16,7 +16,7 @@ from __future__ import annotations
 import difflib
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -170,7 +170,7 @@ def _pair(side: Mapping[str, Any], name: str) -> tuple[float, float] | None:
     return float(u), float(v)
 
 
-def _to_detector_mm(origin: Any, pitch: Any) -> Array:
+def _to_detector_mm(origin: Sequence[float], pitch: Sequence[float]) -> Array:
     return np.array([[pitch[0], 0.0, origin[0]], [0.0, pitch[1], origin[1]], [0.0, 0.0, 1.0]])
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -149,7 +148,7 @@ class RigidTransform:
             raise TypeError("a single transform has no length")
         return int(self.R.shape[0])
 
-    def __getitem__(self, index: Any) -> RigidTransform:
+    def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> RigidTransform:
         return RigidTransform(R=self.R[index], t=self.t[index], source=self.source, target=self.target)
 
     def __iter__(self) -> Iterator[RigidTransform]:

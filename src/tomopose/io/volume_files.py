@@ -9,8 +9,9 @@ from __future__ import annotations
 import json
 import math
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import BinaryIO, cast
 
 import h5py
 import numpy as np
@@ -24,6 +25,7 @@ from tomopose.provenance import Provenance
 from tomopose.reading import parse_json, read_text, reader, require_file, require_inside
 from tomopose.reading.hdf5 import checked_hdf5
 from tomopose.reading.memory import require_memory
+from tomopose.units import Array
 from tomopose.values import require_types
 from tomopose.volume import Volume, VoxelGrid
 
@@ -79,7 +81,7 @@ def read_volume(path: str | Path) -> Volume:
     return read(path)
 
 
-def _grid(shape: Any, spacing: Any, origin: Any) -> VoxelGrid:
+def _grid(shape: Sequence[int], spacing: Sequence[float] | Array, origin: Sequence[float] | Array) -> VoxelGrid:
     """The grid of an array shape (n_z, n_y, n_x), spacing and origin (x, y, z), mm."""
     n_z, n_y, n_x = (int(n) for n in shape)
     spacing, origin = np.asarray(spacing, dtype=np.float64), np.asarray(origin, dtype=np.float64)
@@ -188,11 +190,11 @@ def _read_tiff(path: Path) -> Volume:
 # -- NRRD (teem.sourceforge.net/nrrd/format.html) and MetaImage (itk.org/Wiki/ITK/MetaIO/Documentation) ----------------
 
 
-def _numbers(values: Any) -> list[str]:
+def _numbers(values: Sequence[object]) -> list[str]:
     return [repr(float(x)) for x in values]
 
 
-def _write_raw(stream: Any, values: np.ndarray) -> None:
+def _write_raw(stream: BinaryIO, values: np.ndarray) -> None:
     for part in pieces((values.shape[0], values.shape[1], values.shape[2])):
         stream.write(np.ascontiguousarray(values[part], dtype="<f4").tobytes())
 

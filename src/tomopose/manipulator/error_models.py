@@ -308,7 +308,7 @@ def commands_for(errors: Errors, wanted: PoseSequence) -> PoseSequence:
     )
 
 
-def outside_notes(outside: Any, poses: PoseSequence, whose: str = "the manipulator's") -> tuple[str, ...]:
+def outside_notes(outside: np.ndarray, poses: PoseSequence, whose: str = "the manipulator's") -> tuple[str, ...]:
     """The sentence on poses outside the range in which `whose` errors were identified; none where all lie inside."""
     if not outside.any():
         return ()

@@ -7,6 +7,7 @@ by a matrix of rank 2, so that all candidates are weighed at once without an inv
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -56,7 +57,7 @@ def exchange(
     M: Array,
     N_0: Array | None = None,
     criterion: Criterion = "A",
-    fixed: Any = (),
+    fixed: Sequence[int] = (),
     seed: int = 0,
     starts: int = 3,
 ) -> Chosen:

@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from tomopose.engines.storage import mapped, store, write_layers
 from tomopose.files import atomic_file
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.volume import VoxelGrid
+
+if TYPE_CHECKING:
+    from dask.distributed import Client
 
 
 def every_nth_pixel(matrices: ProjectionMatrices, stride: int) -> ProjectionMatrices:
@@ -234,7 +237,7 @@ class DaskField:
         options: dict[str, object],
         *,
         slabs: int,
-        client: Any,
+        client: Client,
     ) -> None:
         self.grid = grid
         self._bounds = slab_bounds(grid.shape[0], slabs)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,10 +20,15 @@ from tomopose.reconstruction.fdk.filter import FdkFilter
 from tomopose.reconstruction.field import Adding, Field
 from tomopose.reconstruction.line_integrals import LineIntegrals
 
+if TYPE_CHECKING:
+    from tomopose.engines.protocol import Engine
+
 SHORTEST_RAY = 2.0
 """Rays that cross less than this many voxels of the grid have no say: their residual would be divided by almost 0."""
 
 Subset = tuple[int, ...]
+View = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Line integrals, bad pixels, and what fills those in the line integrals' residual."""
 Update = Callable[[Subset, list[Any]], None]
 
 
@@ -54,7 +59,7 @@ def sart_update(field: Field, *, relaxation: float, nonnegative: bool) -> Update
     """One SART step with a subset."""
     shortest = SHORTEST_RAY * float(field.grid.spacing.min())
 
-    def update(subset: Subset, views: list[Any]) -> None:
+    def update(subset: Subset, views: list[View]) -> None:
         residual = stacked(p for p, _, _ in views)
         residual -= field.forward(subset)
         length = field.lengths(subset)
@@ -72,7 +77,7 @@ def fdk_update(field: Field, filtered: FdkFilter) -> Update:
     """Add the views of a subset to the FDK sum."""
     how = Adding(weight="inverse-square", beyond=filtered.beyond)
 
-    def update(subset: Subset, views: list[Any]) -> None:
+    def update(subset: Subset, views: list[View]) -> None:
         images = stacked(filtered(p, j) for j, (p, _, _) in zip(subset, views, strict=True))
         field.back(images, subset, how)
 
@@ -86,7 +91,7 @@ class Samples:
         self.stride = stride
         self.measured: list[np.ndarray | None] = [None] * n
 
-    def keep(self, subset: Subset, views: list[Any]) -> None:
+    def keep(self, subset: Subset, views: list[View]) -> None:
         for j, (p, _, _) in zip(subset, views, strict=True):
             if self.measured[j] is None:
                 self.measured[j] = np.ascontiguousarray(p[:: self.stride, :: self.stride])
@@ -122,7 +127,7 @@ def run(
 
 
 def cgls(
-    engine: Any,
+    engine: Engine,
     scan: LineIntegrals,
     *,
     iterations: int,

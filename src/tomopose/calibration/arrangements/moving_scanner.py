@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from tomopose.geometry.scanner import Scanner
 from tomopose.manipulator.error_models import corrected_poses
 from tomopose.manipulator.inverse import InverseManipulator, inverse_poses
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.manipulator.real_poses import ErrorModel
 from tomopose.observations import BallObservations
 from tomopose.units import Array
 from tomopose.values import require_types
@@ -30,7 +31,7 @@ def calibrate_inverse(
     poses: PoseSequence,
     observations: BallObservations,
     *,
-    manipulator: Any = None,
+    manipulator: ErrorModel | str | Path | Mapping[str, object] | None = None,
     model: str = "auto",
     d_SD_sigma: float = 0.0,
     distances: Mapping[tuple[int, int], tuple[float, float]] | None = None,

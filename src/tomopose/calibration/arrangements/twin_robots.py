@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.calibration.identified.calibrate import known_bars
 from tomopose.calibration.identified.fit import ModelFit, fit_model
@@ -74,7 +75,7 @@ def calibrate_twin(
     *,
     twin: TwinRobots,
     mount: RigidTransform,
-    balls: Mapping[int, Any] | None = None,
+    balls: Mapping[int, ArrayLike] | None = None,
     model: str = "auto",
     free: str | Sequence[str] = "auto",
     fix: Sequence[str] = (),

@@ -53,11 +53,11 @@ def moved_axes(axes: str) -> str:
     return axes if axes.isupper() else axes[::-1].upper()
 
 
-def _euler(axes: Any, angles: Array) -> Array:
+def _euler(axes: str, angles: Array) -> Array:
     return Rotation.from_euler(axes, angles).as_matrix()
 
 
-def _as_declared(kind: str, axes: Any, xyz: Array) -> Array:
+def _as_declared(kind: str, axes: str, xyz: Array) -> Array:
     """The rotations of numbers by axis under the declared kind."""
     if kind == "rotvec":
         return exp_rotation(xyz)
@@ -70,7 +70,7 @@ def _signs(signs: tuple[int, int, int]) -> Change:
     return lambda p: rotated(p, _with(p, np.array(signs, dtype=np.float64)))
 
 
-def _with(p: Problem, factor: Any) -> Array:
+def _with(p: Problem, factor: object) -> Array:
     kind, axes, xyz = _by_axis(p)
     return _as_declared(kind, axes, factor * xyz)
 

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from tomopose.calibration.checks.effects import Columns, Effect, Steps, effects_of, steps_of
 from tomopose.calibration.model.parameters import FreeParameters, free_parameters
@@ -367,7 +368,7 @@ ISOLATED = 2
 """Centres set aside one or two at a time are chance; more neighbours are not, and the tests look at them."""
 
 
-def rows_to_test(keep: Any) -> Any:
+def rows_to_test(keep: npt.NDArray[np.bool_]) -> Any:
     """(n,) bool: the rows used, and those set aside three or more in a row, which no chance explains."""
     keep = np.asarray(keep, dtype=bool)
     rows = keep.copy()

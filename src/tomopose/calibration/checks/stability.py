@@ -11,9 +11,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
 from math import comb
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.special import fdtrc
 
 from tomopose.calibration.checks.cross_validation import held_out
@@ -214,7 +214,7 @@ def repeats(problem: Problem, scale: float) -> tuple[RepeatedPose, ...]:
     return tuple(result)
 
 
-def outlier_block(pose_id: tuple[str, ...], keep: Any) -> OutlierBlock | None:
+def outlier_block(pose_id: tuple[str, ...], keep: npt.NDArray[np.bool_]) -> OutlierBlock | None:
     """The longest run of at least two neighbours set aside among n rows, keep (n,) bool; None where there is no such
     value.
 
@@ -281,7 +281,7 @@ def chi2_with_movements(problem: Problem, free: FreeParameters, fit: Fit, moved:
     return float((rest**2).sum() + (free.information * fit.delta**2).sum())
 
 
-def stability(fit: LinearFit, R_HT: Array, everything: Problem, keep: Any) -> Stability:
+def stability(fit: LinearFit, R_HT: Array, everything: Problem, keep: npt.NDArray[np.bool_]) -> Stability:
     """All checks of a fit, whatever its model.  everything, keep (n,) bool: all rows, and those that the fit used."""
     left_out = held_out(fit)
     d2 = (fit.r_white**2).sum()

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -51,7 +50,7 @@ def calibrate_kinematic(
     observations: BallObservations | Sequence[BallObservations],
     *,
     rigid: Calibration,
-    manipulator: Any = None,
+    manipulator: ErrorModel | str | Path | Mapping[str, object] | None = None,
     model: str = "auto",
     free: FreeParameters | None = None,
     distances: Mapping[tuple[int, int], tuple[float, float]] | None = None,
@@ -140,7 +139,7 @@ def _scale_of(rigid: Calibration) -> float:
     return rigid.errors.translation_scale if isinstance(rigid.errors, RigidErrors) else 1.0
 
 
-def machine_of(manipulator: Any) -> ErrorModel | None:
+def machine_of(manipulator: ErrorModel | str | Path | Mapping[str, object] | None) -> ErrorModel | None:
     """The error model meant by a model, a document or a path."""
     if manipulator is None or isinstance(manipulator, (Hexapod, SerialRobot, PoseMap, InverseManipulator)):
         return manipulator

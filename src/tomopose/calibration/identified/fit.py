@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.special import chdtri
 
 from tomopose.calibration.identified.contradiction import contradicted_beside_errors
@@ -60,7 +61,7 @@ class ModelFit:
         return self.estimate.problem.scatter
 
 
-def distances(estimate: MapEstimate, whole: KinematicProblem, keep: Any) -> Array:
+def distances(estimate: MapEstimate, whole: KinematicProblem, keep: npt.NDArray[np.bool_]) -> Array:
     """(n,) squared residuals of all rows in their own predicted standard deviations; rows not kept are predictions."""
     at = linearise(replace(whole, weight=None), estimate.state)
     W = whiteners(at.C)
@@ -151,7 +152,12 @@ def with_size(estimate: MapEstimate) -> tuple[MapEstimate, float]:
 
 
 def fit_model(
-    problem: KinematicProblem, start: State, *, robust: bool = True, keep: Any = None, widen: bool = False
+    problem: KinematicProblem,
+    start: State,
+    *,
+    robust: bool = True,
+    keep: npt.NDArray[np.bool_] | None = None,
+    widen: bool = False,
 ) -> ModelFit:
     """The optimum of a model from a start, with scatter and size from the data.
 
@@ -236,5 +242,5 @@ def _weights(d2: Array) -> Array:
     return np.maximum((1.0 + d2 / (9.0 * max(1.0, _scale(d2)))) ** -2, 1e-12)
 
 
-def _every_ball(problem: KinematicProblem, keep: Any) -> bool:
+def _every_ball(problem: KinematicProblem, keep: npt.NDArray[np.bool_]) -> bool:
     return len(np.unique(problem.data.ball[keep])) == len(problem.data.ball_ids)

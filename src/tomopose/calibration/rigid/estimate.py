@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -198,7 +197,7 @@ def solve(
 NOISE_ROUNDS = 3
 
 
-def _given_noise(pose_noise: Any) -> PoseNoise | None:
+def _given_noise(pose_noise: str | tuple[float, float]) -> PoseNoise | None:
     """The scatter that was stated, or None where it is to be estimated."""
     if isinstance(pose_noise, str):
         if pose_noise != "auto":
@@ -210,7 +209,11 @@ def _given_noise(pose_noise: Any) -> PoseNoise | None:
 
 
 def with_pose_noise(
-    solution: Solution, pose_noise: Any, *, robust: bool = True, maker: Repeatability | None = None
+    solution: Solution,
+    pose_noise: str | tuple[float, float] | None,
+    *,
+    robust: bool = True,
+    maker: Repeatability | None = None,
 ) -> Solution:
     """The solution with the manipulator's scatter in the weights.
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from tomopose.calibration.model.covariance import inverse_information
 from tomopose.calibration.model.parameters import FreeParameters
@@ -59,7 +60,7 @@ def limit_beside(found: Array, n: int) -> float:
     return min(limit(n), 2.0 * s / (s - 1.0) * math.log(s * (1.0 - p) / p))
 
 
-def studentised(problem: Problem, free: FreeParameters, fit: Fit, keep: Any) -> Array:
+def studentised(problem: Problem, free: FreeParameters, fit: Fit, keep: npt.NDArray[np.bool_]) -> Array:
     """(n,) squared residuals in their own predicted standard deviations.  Rows not kept count as predictions."""
     b = blocks(problem, free, fit)
     J = jacobian(problem, free, b)

@@ -6,8 +6,6 @@ object take the rigid pose that explains most of the difference, and take the rm
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -144,7 +142,7 @@ def _columns(calibration: Calibration, poses: PoseSequence, x_M: Array) -> tuple
     return flat.reshape(J.shape), J_pose
 
 
-def scatter_variance(calibration: Calibration, poses: PoseSequence, x_M: Any) -> Array:
+def scatter_variance(calibration: Calibration, poses: PoseSequence, x_M: Array) -> Array:
     """(n, m, 2) px^2: what the plate's scatter from pose to pose adds to points x_M (m, 3) of the object, and that of
     scanner parameters from view to view.
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Siz
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,9 @@ from tomopose.observations import BallObservations
 from tomopose.units import Array
 from tomopose.values import require_types
 
+if TYPE_CHECKING:
+    from dask.distributed import Client
+
 
 @require_types
 def detect(
@@ -41,11 +44,11 @@ def detect(
     *,
     ball_diameter: float | Mapping[int, float],
     ball_id: Sequence[int] | npt.NDArray[np.int64] | None = None,
-    pose_id: Iterable[Any] | None = None,
+    pose_id: Iterable[str | int] | None = None,
     predicted: npt.ArrayLike | None = None,
     origin: tuple[int, int] | Sequence[tuple[int, int]] = (0, 0),
     workers: int = 1,
-    executor: Any = None,
+    executor: Executor | Client | None = None,
     progress: Callable[[int, int], None] | None = None,
     journal: str | Path | None = None,
     settings: DetectionSettings = DEFAULT,
@@ -248,7 +251,7 @@ def _fetch(images: Any, i: int, task: Task, scanner: Scanner) -> None:
         images.fetch(i, v0, v1)
 
 
-def _origin_of(origin: Any, index: int) -> tuple[int, int]:
+def _origin_of(origin: npt.ArrayLike, index: int) -> tuple[int, int]:
     pair = origin if np.ndim(origin) == 1 else origin[index]
     return pair[0], pair[1]
 

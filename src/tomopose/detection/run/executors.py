@@ -6,11 +6,18 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import ExitStack
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dask.distributed import Client
 
 
 def ordered_map(
-    function: Callable[..., Any], tasks: Iterable[tuple[Any, ...]], *, workers: int = 1, executor: Any = None
+    function: Callable[..., Any],
+    tasks: Iterable[tuple[Any, ...]],
+    *,
+    workers: int = 1,
+    executor: Executor | Client | None = None,
 ) -> Iterator[tuple[tuple[Any, ...], Any]]:
     """(task, function(*task)) for each task, in order; few tasks are under way at a time, so that few images are held.
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from tomopose.detection.image import detect_image
+from tomopose.detection.reading import Image
 from tomopose.errors import InputError, TomoposeError
 from tomopose.geometry.scanner import Scanner
 from tomopose.units import Array
@@ -19,7 +20,7 @@ SQUARE = 0.01
 """Relative difference of the pitches below which an exchange of the two makes none."""
 
 
-def fault_of_input(image: Any, scanner: Scanner, **options: Any) -> InputError | None:
+def fault_of_input(image: Image, scanner: Scanner, **options: Any) -> InputError | None:
     """What is wrong with an image, or with the pitches, in which no ball was found; options: of detect_image."""
     if bytes_are_exchanged(image):
         return InputError("each pixel's two bytes are exchanged: the image is smooth the other way round; read it so")
@@ -35,7 +36,7 @@ def fault_of_input(image: Any, scanner: Scanner, **options: Any) -> InputError |
     return None
 
 
-def bytes_are_exchanged(image: Any) -> bool:
+def bytes_are_exchanged(image: Image) -> bool:
     """Whether an image of 16-bit counts is far smoother along its rows with every pixel's bytes exchanged."""
     step = max(1, int(image.shape[0]) // SAMPLED_ROWS)
     whole = hasattr(image, "region")

@@ -5,7 +5,7 @@ Source: NeXus application definition NXtomo; nxtomo 3.  io/images/formats/nexus.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from tomopose.io.foreign.scanner_draft import ScannerDraft, sensible
 from tomopose.io.images.formats.nexus import DATA, KEYS, LENGTHS, NexusValues, entries, stated_by
 from tomopose.reading import reading
 from tomopose.reading.hdf5 import checked_hdf5
+
+if TYPE_CHECKING:
+    import h5py
 
 HDF5 = b"\x89HDF"
 PROJECTION = 0
@@ -61,14 +64,14 @@ def read(file: ForeignFile) -> ScannerDraft:
     )
 
 
-def _only(nexus: Any, file: ForeignFile) -> Any:
+def _only(nexus: h5py.File, file: ForeignFile) -> Any:
     found = list(entries(nexus))
     if len(found) != 1:
         raise InputError(f"{file.path} holds {len(found)} NXtomo entries; one is needed")
     return found[0]
 
 
-def _projections(entry: Any, n: int) -> Any:
+def _projections(entry: h5py.Group, n: int) -> Any:
     """The frames that are projections: image_key 0."""
     keys = entry.get(KEYS)
     keep = np.ones(n, dtype=bool) if keys is None else np.asarray(keys[()]).reshape(-1) == PROJECTION

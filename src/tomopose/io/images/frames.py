@@ -29,7 +29,7 @@ class FrameSource(Protocol):
     def read(self, index: int, band: Band) -> Image: ...
 
 
-def read_block(path: Path, offset: int, shape: tuple[int, int], dtype: np.dtype[Any], band: Band) -> Image:
+def read_block(path: Path, offset: int, shape: tuple[int, int], dtype: np.dtype[np.generic], band: Band) -> Image:
     """Part of an uncompressed image that lies in one piece in a file: a mapped view, so that it is copied only once.
 
     dtype may be of the other endianness; the result is native.  FileError names a file that is too short.
@@ -63,7 +63,7 @@ def unreadable(path: Path, error: OSError) -> FileError:
     return FileError(f"{path} {why}", path=path)
 
 
-def require_one_kind(kinds: list[tuple[str, tuple[int, int], np.dtype[Any]]]) -> None:
+def require_one_kind(kinds: list[tuple[str, tuple[int, int], np.dtype[np.generic]]]) -> None:
     """InputError naming the first frame, of (name, shape, dtype) each, that differs from frame 0."""
     name_0, shape_0, dtype_0 = kinds[0]
     for name, shape, dtype in kinds[1:]:
@@ -76,7 +76,7 @@ def require_one_kind(kinds: list[tuple[str, tuple[int, int], np.dtype[Any]]]) ->
             raise InputError(f"{name} holds {dtype.name}, {name_0} {dtype_0.name}; all images have one type")
 
 
-def require_grey(name: str, dtype: np.dtype[Any], samples: int = 1) -> None:
+def require_grey(name: str, dtype: np.dtype[np.generic], samples: int = 1) -> None:
     """InputError for colour, alpha, complex or Boolean pixels."""
     if samples != 1:
         raise InputError(

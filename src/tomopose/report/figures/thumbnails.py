@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -115,7 +114,7 @@ def worst_first(d: ArrayLike, seen: ArrayLike) -> list[int]:
 
 def worst_thumbnails(
     observations: BallObservations,
-    images: Sequence[Any],
+    images: Sequence[ArrayLike],
     *,
     residuals: Mapping[str, float] | None = None,
     count: int = 12,

@@ -6,7 +6,7 @@ import base64
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, SupportsFloat
+from typing import TYPE_CHECKING, Any, SupportsFloat
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from tomopose.provenance import Provenance
 from tomopose.report.page import BAD, GOOD, Block, Figure, KeyFigure, Page, Section, Table, Verdict, Words, render
 from tomopose.report.pages.provenance_section import provenance_section
 from tomopose.report.words import number
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 COLUMNS = ("quantity", "unit", "printed", "by the paper's method", "by our best", "where, and notes")
 ABSENT = "–"
@@ -124,7 +127,7 @@ def _text(value: object) -> str:
     return str(value.get("text", "")) if isinstance(value, Mapping) else str(value or "")
 
 
-def _colours(scale: Any) -> Any:
+def _colours(scale: str | Sequence[str]) -> Any:
     """A colour map of plotly's as matplotlib's: (place, "rgb(r,g,b)" or "#rrggbb") pairs; None for the default."""
     if scale is None:
         return None
@@ -138,7 +141,7 @@ def _colours(scale: Any) -> Any:
     return LinearSegmentedColormap.from_list("scale", [(place, colour(text)) for place, text in scale])
 
 
-def _decorate(ax: Any, plan: Mapping[str, Any]) -> None:
+def _decorate(ax: Axes, plan: Mapping[str, Any]) -> None:
     """Embedded pictures, words and shape of a plotly layout."""
     from matplotlib import image
 
@@ -167,7 +170,7 @@ def _decorate(ax: Any, plan: Mapping[str, Any]) -> None:
         ax.set_aspect("equal")
 
 
-def _draw(ax: Any, trace: Mapping[str, Any], k: int, n: int) -> None:
+def _draw(ax: Axes, trace: Mapping[str, Any], k: int, n: int) -> None:
     """One trace; bars are side by side, this one the k-th of n."""
     kind, name = trace["type"], str(trace.get("name", ""))
     marker, line = trace.get("marker", {}), trace.get("line", {})

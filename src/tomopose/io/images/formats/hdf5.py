@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from tomopose.io.images.frames import Band, Image, require_grey
 from tomopose.io.images.stated import Stated
 from tomopose.reading import reading
 from tomopose.reading.hdf5 import checked_hdf5
+
+if TYPE_CHECKING:
+    import h5py
 
 PROJECTION, FLAT, DARK = 0, 1, 2
 """NXtomo's image_key; 3 marks frames to be left out."""
@@ -94,7 +97,7 @@ def open_hdf5(path: Path, name: str, dataset: str | None) -> Hdf5Source:
         )
 
 
-def _facts(file: Any, data: Any, frames: Image) -> tuple[Stated | None, tuple[float, ...] | None]:
+def _facts(file: h5py.File, data: h5py.Dataset, frames: Image) -> tuple[Stated | None, tuple[float, ...] | None]:
     """What an NXtomo entry says of the scan, if the stack is its data: geometry, and the table angle of each frame."""
     for entry in entries(file):
         if entry[DATA] == data:
@@ -103,11 +106,11 @@ def _facts(file: Any, data: Any, frames: Image) -> tuple[Stated | None, tuple[fl
     return None, None
 
 
-def _stacks(file: Any) -> list[str]:
+def _stacks(file: h5py.File) -> list[str]:
     """The names of all three-dimensional datasets; one that several links lead to is named once."""
     found: list[str] = []
 
-    def visit(name: str, item: Any) -> None:
+    def visit(name: str, item: h5py.Dataset | h5py.Group) -> None:
         if getattr(item, "ndim", 0) == 3:
             found.append(name)
 
@@ -115,7 +118,7 @@ def _stacks(file: Any) -> list[str]:
     return found
 
 
-def _only(path: Path, file: Any, stacks: list[str]) -> str:
+def _only(path: Path, file: h5py.File, stacks: list[str]) -> str:
     """The stack of NXtomo, or the only one there is."""
     candidates = [s for s in stacks if _key_beside(file, s) is not None] or stacks
     if len(candidates) == 1:
@@ -125,12 +128,12 @@ def _only(path: Path, file: Any, stacks: list[str]) -> str:
     )
 
 
-def _key_beside(file: Any, stack: str) -> str | None:
+def _key_beside(file: h5py.File, stack: str) -> str | None:
     name = f"{stack.rpartition('/')[0]}/image_key".lstrip("/")
     return name if name in file else None
 
 
-def _image_key(path: Path, file: Any, stack: str, n: int) -> Image:
+def _image_key(path: Path, file: h5py.File, stack: str, n: int) -> Image:
     name = _key_beside(file, stack)
     if name is None:
         return np.full(n, PROJECTION)

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tomopose.io.images.stated import Stated
 from tomopose.units import Array
+
+if TYPE_CHECKING:
+    import h5py
 
 LENGTHS = {"m": 1000.0, "metre": 1000.0, "meter": 1000.0, "cm": 10.0, "mm": 1.0, "um": 1e-3, "µm": 1e-3, "nm": 1e-6}
 ANGLES = {"deg": 1.0, "degree": 1.0, "degrees": 1.0, "rad": 180 / np.pi, "radian": 180 / np.pi, "radians": 180 / np.pi}
@@ -54,7 +57,7 @@ class NexusValues:
         return found if found is not None and found.shape == (n,) and np.isfinite(found).all() else None
 
 
-def entries(nexus: Any) -> Iterator[Any]:
+def entries(nexus: h5py.File) -> Iterator[Any]:
     """The entries of a file that have a detector's data and a sample's angle."""
     for entry in nexus.values():
         if hasattr(entry, "values") and DATA in entry and "sample/rotation_angle" in entry:
