@@ -34,7 +34,7 @@ from tomopose.units import Array
 from tomopose.values import require_types
 
 if TYPE_CHECKING:
-    from dask.distributed import Client
+    pass
 
 
 @require_types
@@ -48,7 +48,7 @@ def detect(
     predicted: npt.ArrayLike | None = None,
     origin: tuple[int, int] | Sequence[tuple[int, int]] = (0, 0),
     workers: int = 1,
-    executor: Executor | Client | None = None,
+    executor: object = None,
     progress: Callable[[int, int], None] | None = None,
     journal: str | Path | None = None,
     settings: DetectionSettings = DEFAULT,
