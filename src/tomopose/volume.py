@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 from typing import Any
 
@@ -72,7 +72,8 @@ class VoxelGrid:
     def corners(self) -> Array:
         """The eight outer corners of the grid's box (8, 3), mm in W: half a voxel beyond the outermost centres."""
         half = self.spacing * np.array(self.n_xyz) / 2
-        return self.centre + BOX_CORNERS * half
+        corners: Array = self.centre + BOX_CORNERS * half
+        return corners
 
     @property
     def index_to_W(self) -> Array:
@@ -146,7 +147,7 @@ class Volume:
         """Whether the volume contradicts none of the views that it was made from."""
         return not self.contradicted
 
-    def slices(self, at: ArrayLike | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def slices(self, at: Sequence[int] | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Three orthogonal slices through voxel `at` (iz, iy, ix), the middle unless given: [y, x], [z, x], [z, y]."""
         iz, iy, ix = (n // 2 for n in self.grid.shape) if at is None else (int(i) for i in at)
         if not all(0 <= i < n for i, n in zip((iz, iy, ix), self.grid.shape, strict=True)):

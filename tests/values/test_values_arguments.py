@@ -98,6 +98,14 @@ def test_what_fits_the_annotations_passes():
     assert everything((), points=7.0) == "ran"
 
 
+def test_what_can_be_gone_through_only_once_is_not_used_up_by_the_check():
+    _, poses = scanner_and_poses()
+    once = (p for p in [poses])
+    with pytest.raises(InputError, match=r"^pose must be a PoseSequence; a generator was given"):
+        everything(once)
+    assert len(list(once)) == 1
+
+
 @pytest.mark.parametrize(
     ("name", "given", "words"),
     [

@@ -85,7 +85,7 @@ class Given:
         return ProjectionMatrices(P=P, n_u=n_u, n_v=n_v, p_u=p_u, p_v=p_v, pose_id=names)
 
 
-def _require_sensible(name: str, value: float | None, source: str) -> None:
+def _require_sensible(name: str, value: Any, source: str) -> None:
     """InputError for a size that is no positive whole number and a pitch that is no positive number."""
     if value is None:
         return

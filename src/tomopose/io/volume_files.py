@@ -190,7 +190,7 @@ def _read_tiff(path: Path) -> Volume:
 # -- NRRD (teem.sourceforge.net/nrrd/format.html) and MetaImage (itk.org/Wiki/ITK/MetaIO/Documentation) ----------------
 
 
-def _numbers(values: Sequence[object]) -> list[str]:
+def _numbers(values: Sequence[float] | Array) -> list[str]:
     return [repr(float(x)) for x in values]
 
 

@@ -13,7 +13,7 @@ import types
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, wraps
-from typing import ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -154,7 +154,7 @@ def _test_of_one(hint: object) -> Test | None:
     if issubclass(kind, Sequence) and parts:
         return _may_be_numbers if parts[0] in (int, float) else _each(_test(parts[0]), Sequence)
     if kind is Iterable:  # what it holds may be made as it is asked for
-        return lambda value: isinstance(value, Iterable) and not isinstance(value, (str, bytes))
+        return _holds_items
     return None
 
 
@@ -192,15 +192,21 @@ def _may_be_numbers(value: object) -> bool:
     return not wrong and not type(value).__module__.startswith("tomopose.")
 
 
+def _holds_items(value: object) -> bool:
+    """Whether one can go through a value: an iterable, or what has a length and numbered items."""
+    return not isinstance(value, (str, bytes, type)) and (hasattr(value, "__iter__") or hasattr(value, "__getitem__"))
+
+
 def _each(test: Test | None, container: type) -> Test | None:
     """Whether a value is such a container whose every item passes."""
     if test is None:
         return None
 
     def holds(value: object) -> bool:
-        if isinstance(value, (str, bytes)) or not isinstance(value, container) or not isinstance(value, Iterable):
-            return False
-        items: Iterable[object] = value.values() if isinstance(value, Mapping) else value
-        return all(map(test, items))
+        if isinstance(value, Mapping):
+            return container is Mapping and all(map(test, value.values()))
+        if container is Mapping or not _holds_items(value) or not hasattr(value, "__len__"):
+            return False  # what has no length could be gone through only once
+        return all(map(test, cast(Iterable[object], value)))
 
     return holds

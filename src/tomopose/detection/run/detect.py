@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Siz
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,9 +32,6 @@ from tomopose.kept import key_of
 from tomopose.observations import BallObservations
 from tomopose.units import Array
 from tomopose.values import require_types
-
-if TYPE_CHECKING:
-    pass
 
 
 @require_types

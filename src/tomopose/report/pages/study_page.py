@@ -127,7 +127,7 @@ def _text(value: object) -> str:
     return str(value.get("text", "")) if isinstance(value, Mapping) else str(value or "")
 
 
-def _colours(scale: str | Sequence[str]) -> Any:
+def _colours(scale: Sequence[tuple[float, str]] | None) -> Any:
     """A colour map of plotly's as matplotlib's: (place, "rgb(r,g,b)" or "#rrggbb") pairs; None for the default."""
     if scale is None:
         return None
@@ -174,7 +174,7 @@ def _draw(ax: Axes, trace: Mapping[str, Any], k: int, n: int) -> None:
     """One trace; bars are side by side, this one the k-th of n."""
     kind, name = trace["type"], str(trace.get("name", ""))
     marker, line = trace.get("marker", {}), trace.get("line", {})
-    shown = {} if trace.get("showlegend") is False or not name else {"label": name}
+    shown: dict[str, Any] = {} if trace.get("showlegend") is False or not name else {"label": name}
     if kind in ("scatter", "scatter3d"):
         lines = "lines" in trace.get("mode", "lines")
         points = [trace["x"], trace["y"], *([trace["z"]] if kind == "scatter3d" else [])]

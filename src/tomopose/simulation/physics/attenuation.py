@@ -36,7 +36,7 @@ def tabulated(w: Array, mu: Array) -> tuple[Array, Any, Array]:
 
 
 @njit(cache=True, nogil=True)
-def attenuated(beam: tuple[Array, Array, Array], L: np.ndarray) -> float:
+def attenuated(beam: tuple[Array, Array, Array, Array, Array], L: np.ndarray) -> float:
     """Transmission of one ray with path lengths L (m,), mm; beam: (w, mu, *tabulated(w, mu))."""
     w, mu, scale, first, table = beam
     only, several = -1, False
