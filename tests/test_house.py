@@ -13,12 +13,11 @@ SOURCE = Path(__file__).resolve().parents[1] / "src" / "tomopose"
 FILES = sorted(SOURCE.rglob("*.py"))
 
 MOST_FILES, MOST_LINES, MOST_PARAMETERS, DEEPEST = 12, 80, 12, 4
-MOST_ANY = 480
-"""The goal is 150; the number may only fall."""
+MOST_ANY = 150
+"""The number may only fall."""
 
 TO_BE_SPLIT = {
     "calibration/arrangements/moving_scanner.py:calibrate_inverse",
-    "calibration/arrangements/twin_robots.py:calibrate_twin",
     "calibration/identified/calibrate.py:calibrate_kinematic",
     "calibration/model/problem.py:pair",
     "calibration/solve.py:calibrate",

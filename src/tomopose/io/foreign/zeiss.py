@@ -14,9 +14,6 @@ from tomopose.io.foreign.scanner_draft import ScannerDraft, sensible
 from tomopose.io.images.formats.xradia import first, numbers, open_container, stated_by
 from tomopose.reading import reading
 
-if TYPE_CHECKING:
-    pass
-
 OLE = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
 ENDINGS = (".txrm", ".xrm", ".txm")
 

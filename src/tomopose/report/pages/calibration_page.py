@@ -28,11 +28,11 @@ from tomopose.report.page import (
     Words,
     render,
 )
-from tomopose.report.pages.checks_section import checks_section, findings_table
 from tomopose.report.pages.history_page import history_section
-from tomopose.report.pages.observability_section import observability_section
-from tomopose.report.pages.parameters_section import parameters_section
-from tomopose.report.pages.provenance_section import provenance_section
+from tomopose.report.sections.checks import checks_section, findings_table
+from tomopose.report.sections.observability import observability_section
+from tomopose.report.sections.parameters import parameters_section
+from tomopose.report.sections.provenance import provenance_section
 from tomopose.report.words import (
     NOT_DETERMINABLE,
     NOT_GIVEN,

@@ -14,7 +14,7 @@ from tomopose.calibration.records.monitor import Monitoring, monitor
 from tomopose.coverage import K2, expanded_k2
 from tomopose.errors import InputError
 from tomopose.report.page import CARE, GOOD, Block, Figure, Page, Section, Table, Verdict, render
-from tomopose.report.pages.checks_section import probability
+from tomopose.report.sections.checks import probability
 from tomopose.report.style import ACCENT, ALERT, LINE, SOFT, axis, layout
 from tomopose.report.words import meaning, number, small_unit, symbol
 from tomopose.units import MICROMETRES_PER_MM, MICRORADIANS_PER_RAD

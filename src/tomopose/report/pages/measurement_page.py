@@ -20,7 +20,7 @@ from tomopose.report.figures.measurement_figures import (
     group_bars,
 )
 from tomopose.report.page import BAD, CARE, GOOD, Block, KeyFigure, Page, Section, Table, Verdict, Words, render
-from tomopose.report.pages.provenance_section import provenance_section
+from tomopose.report.sections.provenance import provenance_section
 from tomopose.report.words import NOT_DETERMINABLE, number
 from tomopose.units import MICROMETRES_PER_MM, Array
 

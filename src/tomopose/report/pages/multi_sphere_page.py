@@ -9,7 +9,7 @@ from tomopose.calibration.arrangements.multi_sphere.result import MultiSphereCal
 from tomopose.report.figures.coverage_figures import scan_effect
 from tomopose.report.figures.scene_figures import source_path
 from tomopose.report.page import BAD, CARE, GOOD, Block, Figure, KeyFigure, Page, Section, Table, Verdict, Words, render
-from tomopose.report.pages.provenance_section import provenance_section
+from tomopose.report.sections.provenance import provenance_section
 from tomopose.report.style import ACCENT, ALERT, ORANGE, axis, layout
 from tomopose.report.words import number
 

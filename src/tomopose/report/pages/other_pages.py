@@ -27,7 +27,7 @@ from tomopose.report.page import (
     Words,
     render,
 )
-from tomopose.report.pages.provenance_section import provenance_section
+from tomopose.report.sections.provenance import provenance_section
 from tomopose.report.style import ACCENT, ALERT, ORANGE, axis, layout
 from tomopose.report.words import NOT_DETERMINABLE, NOT_GIVEN, number
 

@@ -14,7 +14,7 @@ from tomopose.errors import EngineMissingError
 from tomopose.files import atomic_file
 from tomopose.provenance import Provenance
 from tomopose.report.page import BAD, GOOD, Block, Figure, KeyFigure, Page, Section, Table, Verdict, Words, render
-from tomopose.report.pages.provenance_section import provenance_section
+from tomopose.report.sections.provenance import provenance_section
 from tomopose.report.words import number
 
 if TYPE_CHECKING:

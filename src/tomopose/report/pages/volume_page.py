@@ -8,7 +8,7 @@ import numpy as np
 
 from tomopose.report.figures.png import data_uri, grey_levels, grey_png
 from tomopose.report.page import Block, Figure, KeyFigure, Page, Section, Table, Words, render
-from tomopose.report.pages.provenance_section import provenance_section
+from tomopose.report.sections.provenance import provenance_section
 from tomopose.report.style import ACCENT, axis, layout
 from tomopose.report.words import cell
 from tomopose.volume import Volume
