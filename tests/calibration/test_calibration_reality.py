@@ -139,7 +139,7 @@ def test_the_makers_repeatability_is_the_prior_of_the_scatter():
 
     poses = mixed_poses(n=40)
     fine, coarse = (
-        tp.calibrate(SCANNER, poses, observe(poses), repeatability=Repeatability(t_mm=t, w_rad=w)).pose_noise
+        tp.calibrate(SCANNER, poses, observe(poses), pose_noise=Repeatability(t_mm=t, w_rad=w)).pose_noise
         for t, w in ((2e-5, 1e-7), (5e-3, 5e-5))
     )
     assert fine is not None

@@ -116,7 +116,7 @@ def projection_matrices(
     commanded = poses
     poses = corrected_poses(calibration.errors, poses)
     own = calibration.scanner
-    alpha = np.zeros(len(poses)) if poses.alpha is None else poses.alpha
+    alpha = poses.alpha
     T_0 = RigidTransform.identity(Frame.M, Frame.H) if home is None else home.require(Frame.M, Frame.H)
     to_W = own.T_TW(0.0) @ calibration.T_HT @ T_0
     P = eq5_matrices(own, T_HT=calibration.T_HT, T_MH=poses.T_MH, alpha=alpha, home=T_0)

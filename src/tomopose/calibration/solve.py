@@ -200,10 +200,8 @@ def calibrate(
     priors: Mapping[str, float] | None = None,
     robust: bool = True,
     hypotheses: bool | Sequence[Alternative] = True,
-    pose_noise: str | tuple[float, float] | None = "auto",
-    repeatability: Repeatability | None = None,
+    pose_noise: str | Repeatability | tuple[float, float] | None = "auto",
     distances: Mapping[tuple[int, int], tuple[float, float]] | None = None,
-    raise_on_failure: bool = True,
 ) -> Calibration:
     """Find T_HT and t from radiographs of one ball.  Eq. (7), in one step, from no start value.
 
@@ -225,24 +223,19 @@ def calibrate(
     hypotheses:   try the cheap alternative conventions (or those given) and say so in the verdict; all of them
                   where neither these nor the declared one fit.
     pose_noise:   scatter of the manipulator about the poses it reports: "auto" estimates it as the root mean of
-                  its posterior, never tested to zero; (mm, rad) states it; None has none.
-    repeatability: the maker's, prior of the scatter; default: the manipulator's file's, or the paper's hexapod's.
+                  its posterior, never tested to zero; (mm, rad) states it; None has none.  Its prior is the maker's
+                  repeatability: a Repeatability given here, else the manipulator's file's or the paper's hexapod's.
     distances:    (ball id, ball id) -> (distance, standard uncertainty), mm: scale bars.  With them the balls are
                   solved for by the estimator of the manipulator's errors, so model must not be "rigid".
-    raise_on_failure: raise where no optimum was reached; otherwise the status says so.
 
     Raises
     ------
     InputError          unknown ids or names, too few poses.
     NotObservableError  a direction that the poses (with the priors) cannot determine, in words.
-    NotConvergedError   no optimum, with the calibration as far as it came.
+    NotConvergedError   no optimum; its `calibration` is as far as it came.
     """
-    if model not in MODELS:
-        raise InputError(f"unknown model {model!r}; known are {', '.join(MODELS)}")
-    if model == "kinematic" and manipulator is None:
-        raise InputError("model 'kinematic' needs the manipulator's nominal geometry (--manipulator FILE)")
-    if distances and (model == "rigid" or (model == "auto" and manipulator is None)):
-        raise InputError("distances between balls serve models with the manipulator's errors; give its geometry")
+    trusts_poses = model == "rigid" or (model == "auto" and manipulator is None)
+    _require_model(model, has_geometry=manipulator is not None, distances=bool(distances) and trusts_poses)
     free, auto = freed_names(free)
     rigid, freed = rigid_calibration(
         scanner,
@@ -250,21 +243,16 @@ def calibrate(
         observations,
         free=free,
         auto=auto,
-        maker=maker_of(manipulator, repeatability),
+        maker=pose_noise if isinstance(pose_noise, Repeatability) else maker_of(manipulator),
         fix=fix,
         priors=priors,
         robust=robust,
         hypotheses=hypotheses,
-        pose_noise=pose_noise,
-        raise_on_failure=raise_on_failure,
+        pose_noise="auto" if isinstance(pose_noise, Repeatability) else pose_noise,
     )
-    if rigid.provenance is not None:
-        arguments = {"model": model, **rigid.provenance.arguments}
-        rigid = replace(rigid, provenance=replace(rigid.provenance, arguments=arguments))
-    if model == "rigid" or (model == "auto" and manipulator is None):
-        return rigid
-    if rigid.verdict == "rejected":
-        # a manipulator's errors, fitted to a wrong reading of the data, explain anything
+    rigid = _said(rigid, model)
+    # a manipulator's errors, fitted to a wrong reading of the data, explain anything
+    if trusts_poses or rigid.verdict == "rejected":
         return rigid
     from tomopose.calibration.identified.calibrate import calibrate_kinematic
 
@@ -282,6 +270,24 @@ def calibrate(
     )
 
 
+def _require_model(model: str, *, has_geometry: bool, distances: bool) -> None:
+    """InputError for an unknown model, one without the geometry that it needs, or distances that nothing uses."""
+    if model not in MODELS:
+        raise InputError(f"unknown model {model!r}; known are {', '.join(MODELS)}")
+    if model == "kinematic" and not has_geometry:
+        raise InputError("model 'kinematic' needs the manipulator's nominal geometry (--manipulator FILE)")
+    if distances:
+        raise InputError("distances between balls serve models with the manipulator's errors; give its geometry")
+
+
+def _said(rigid: Calibration, model: str) -> Calibration:
+    """The calibration whose provenance names the model that was asked for."""
+    if rigid.provenance is None:
+        return rigid
+    arguments = {"model": model, **rigid.provenance.arguments}
+    return replace(rigid, provenance=replace(rigid.provenance, arguments=arguments))
+
+
 def freed_names(free: str | Sequence[str]) -> tuple[tuple[str, ...], bool]:
     """(names to free, whether values that the images contradict are freed too) of "auto", "none" or names."""
     if isinstance(free, str):
@@ -293,12 +299,10 @@ def freed_names(free: str | Sequence[str]) -> tuple[tuple[str, ...], bool]:
     return tuple(free), not free
 
 
-def maker_of(
-    manipulator: ErrorModel | str | Path | Mapping[str, object] | None, stated: Repeatability | None
-) -> Repeatability | None:
-    """The maker's repeatability: as stated, else as the manipulator's file says; None: not known."""
-    if stated is not None or manipulator is None:
-        return stated
+def maker_of(manipulator: ErrorModel | str | Path | Mapping[str, object] | None) -> Repeatability | None:
+    """The maker's repeatability, as the manipulator's file says; None: not known."""
+    if manipulator is None:
+        return None
     from tomopose.calibration.identified.calibrate import machine_of
 
     machine = machine_of(manipulator)
@@ -354,7 +358,6 @@ def rigid_calibration(
     robust: bool = True,
     hypotheses: bool | Sequence[Alternative] = True,
     pose_noise: str | tuple[float, float] | None = "auto",
-    raise_on_failure: bool = True,
     arrangement: Arrangement = "moving-object",
 ) -> tuple[Calibration, FreeParameters]:
     """The calibration that trusts the poses, and what was freed; arguments as of `calibrate`."""
@@ -389,6 +392,6 @@ def rigid_calibration(
     taken = Taken(assumed=(*assumed, *_scatter_assumed(pose_noise, maker)), contradicted=against)
     found = _rigid(solution, stated, diagnosis, arrangement, arguments, taken)
     found = replace(found, scanner=replace(found.scanner, sigma=plain.scanner.sigma))
-    if not found.converged and raise_on_failure:
+    if not found.converged:
         raise NotConvergedError(found.status, calibration=found)
     return found, freed

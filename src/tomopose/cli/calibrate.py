@@ -171,7 +171,7 @@ def solve(o: Options, given: Inputs) -> Calibration:
             poses,
             observations,
             manipulator=given.manipulator,
-            repeatability=repeatability_of(o.repeatability),
+            pose_noise=repeatability_of(o.repeatability) or "auto",
             **settings,
         )
     except NotConvergedError as error:

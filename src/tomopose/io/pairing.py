@@ -47,7 +47,7 @@ def _warn_if_the_table_differs(poses: PoseSequence, images: ImageSequence, found
     Zero and sense of the two may differ, so turns from the first image are compared, in either sense.
     """
     stated = getattr(images.source, "angles_deg", None)
-    if stated is None or poses.alpha is None or len(found) < 2:
+    if stated is None or len(found) < 2:
         return
     theirs = np.radians([stated[images.index[int(k)]] for k in found])
     turn, ours = theirs - theirs[0], poses.alpha - poses.alpha[0]

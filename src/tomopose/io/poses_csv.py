@@ -338,7 +338,6 @@ def write_poses(
     c = convention_named(convention or poses.convention)
     columns: dict[str, Sequence[object]] = {"pose_id": poses.pose_id}
     columns |= _columns(poses.T_MH, c, commanded=False)
-    assert poses.alpha is not None
     if np.any(poses.alpha != 0):
         columns["alpha_deg"] = np.degrees(poses.alpha).tolist()
     if poses.image is not None:
@@ -376,7 +375,6 @@ def _looks_doubtful(poses: PoseSequence, c: Convention) -> bool:
                 unit_checks.require_millimetres(T.t, "", convention=c.name)
                 if c.unit == "deg":
                     unit_checks.require_degrees(convention_from_rotation(T.R, c.name), "")
-        assert poses.alpha is not None
         unit_checks.require_table_degrees(np.degrees(poses.alpha), "")
     except UnitError:
         return True

@@ -18,7 +18,7 @@ from tomopose.units import Array
 
 
 def _alpha(poses: PoseSequence) -> Array:
-    return np.degrees(np.zeros(len(poses)) if poses.alpha is None else poses.alpha)
+    return np.degrees(poses.alpha)
 
 
 def _table_lines(poses: PoseSequence, comment: str) -> list[list[str]]:

@@ -58,7 +58,7 @@ class PlanLimits:
 def allowed(scanner: Scanner, poses: PoseSequence, *, T_HT: RigidTransform, t: Array, limits: PlanLimits) -> np.ndarray:
     """(n,) bool: in view with the whole ball, within the magnification, and without collision."""
     good = ball_in_view(scanner, T_HT=T_HT, poses=poses, t=t, radius=limits.ball_radius, margin=limits.margin)
-    alpha = np.zeros(len(poses)) if poses.alpha is None else poses.alpha
+    alpha = poses.alpha
     if limits.magnification is not None:
         x_H = (poses.T_MH.R @ t) + poses.T_MH.t
         T_TW = scanner.T_TW(alpha)

@@ -15,7 +15,7 @@ TWO_OPT_PASSES = 30
 
 def move_times(poses: PoseSequence, limits: PlanLimits) -> Array:
     """(n, n) s from pose to pose: the slowest of translation, rotation and table, and settling."""
-    T, alpha = poses.T_MH, np.zeros(len(poses)) if poses.alpha is None else poses.alpha
+    T, alpha = poses.T_MH, poses.alpha
     way = np.linalg.norm(T.t[:, None] - T.t[None], axis=2) / limits.speed
     n = len(poses)
     turn = rotation_angle_between(np.repeat(T.R, n, axis=0), np.tile(T.R, (n, 1, 1))).reshape(n, n) / limits.turn_speed
@@ -80,7 +80,7 @@ def ordered(poses: PoseSequence, limits: PlanLimits) -> PoseSequence:
 def rows_of(poses: PoseSequence, rows: ArrayLike) -> PoseSequence:
     """Those rows as a sequence of set poses named p000, p001, ...; a row may come more than once."""
     index = np.asarray(rows, dtype=np.intp)
-    alpha = np.zeros(len(poses)) if poses.alpha is None else poses.alpha
+    alpha = poses.alpha
     return PoseSequence(
         T_MH=poses.T_MH[index],
         pose_id=tuple(f"p{k:03d}" for k in range(len(index))),

@@ -61,9 +61,7 @@ class Resolvability:
 
 def exact_problem(scanner: Scanner, poses: PoseSequence, *, T_HT: RigidTransform, t: Array, sigma: float) -> Problem:
     """The centres that these poses would show, without noise; sigma: standard uncertainty of a coordinate, px."""
-    x = project_ball(
-        scanner, T_HT=T_HT, T_MH=poses.T_MH, t=t, alpha=np.zeros(len(poses)) if poses.alpha is None else poses.alpha
-    )
+    x = project_ball(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=t, alpha=poses.alpha)
     return pair(scanner, poses, BallObservations.from_sigma(x, sigma, pose_id=poses.pose_id))
 
 

@@ -59,7 +59,7 @@ class Path:
 def path_of(scan: PoseSequence, magnification: float) -> Path:
     """The source's path of a scan by the true mount, taken from the matrices of eq. (5)."""
     setup, scanner = demo_setup(paper=True), paper_scanner(magnification)
-    alpha = np.zeros(len(scan)) if scan.alpha is None else scan.alpha
+    alpha = scan.alpha
     P = eq5_matrices(scanner, T_HT=setup.T_HT, T_MH=scan.T_MH, alpha=alpha)
     turned = scanner.T_WS.R.T @ np.linalg.inv(scanner.K) @ P[:, :, :3]
     return Path(source=source_path(P), R=turned @ np.swapaxes(R_z(alpha), -1, -2), alpha=alpha)

@@ -12,8 +12,10 @@ from numpy.typing import ArrayLike
 
 from tomopose.calibration.identified.calibrate import calibrate_kinematic
 from tomopose.calibration.projection_matrices import projection_matrices
+from tomopose.calibration.result import Calibration
 from tomopose.calibration.solve import calibrate
 from tomopose.calibration.uncertainty.trajectory import object_points, rms_px, trajectory_sigma, without_object_pose
+from tomopose.errors import NotConvergedError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import eq5_matrices, project_ball
 from tomopose.geometry.rotations import R_y, R_z
@@ -194,15 +196,11 @@ CASES: Mapping[str, Callable[[np.random.Generator], Experiment]] = MappingProxyT
 )
 
 
-def alpha_of(poses: PoseSequence) -> Array:
-    return np.zeros(len(poses)) if poses.alpha is None else poses.alpha
-
-
 def observe(e: Experiment, rng: np.random.Generator) -> BallObservations:
     """Centres of the balls on the real machine, with the paper's detection error."""
     real = real_motion(e.machine, e.poses, e.p, disturbance=Disturbance(), rng=rng)
     t = e.balls[np.asarray(e.poses.ball_id)]
-    x = project_ball(e.scanner, T_HT=e.T_HT, T_MH=real.T_MH, t=t, alpha=alpha_of(e.poses))
+    x = project_ball(e.scanner, T_HT=e.T_HT, T_MH=real.T_MH, t=t, alpha=e.poses.alpha)
     sigma = DETECTION_PX / np.sqrt(2)
     return BallObservations.from_sigma(x + sigma * rng.standard_normal(x.shape), sigma, pose_id=e.poses.pose_id)
 
@@ -213,12 +211,17 @@ def solve_case(name: str, seed: int) -> dict[str, Any]:
     e = CASES[name](rng)
     scanner = e.scanner
     seen = observe(e, rng)
-    rigid = calibrate(scanner, e.poses, seen, model="rigid", hypotheses=False, raise_on_failure=False)
+    try:
+        rigid = calibrate(scanner, e.poses, seen, model="rigid", hypotheses=False)
+    except NotConvergedError as error:
+        if not isinstance(error.calibration, Calibration):
+            raise
+        rigid = error.calibration
     best = calibrate_kinematic(
         scanner, e.poses, seen, rigid=rigid, manipulator=e.believed, model="kinematic", distances=e.distances
     )
     truth = real_motion(e.machine, e.scan, e.p)
-    P_true = eq5_matrices(scanner, T_HT=e.T_HT, T_MH=truth.T_MH, alpha=alpha_of(e.scan))
+    P_true = eq5_matrices(scanner, T_HT=e.T_HT, T_MH=truth.T_MH, alpha=e.scan.alpha)
     points = (scanner.T_TW(0.0) @ e.T_HT).apply(e.centre + object_points())
     errors = [rms_px(without_object_pose(projection_matrices(c, e.scan).P, P_true, points)) for c in (rigid, best)]
     u = float(np.sqrt(np.mean(np.sum(trajectory_sigma(best, e.scan, points) ** 2, axis=-1))))
@@ -231,7 +234,7 @@ def table_row() -> StudyRow:
     setup, scanner = demo_setup(paper=True), paper_scanner()
     u = []
     for poses in (pose_grid((2, 2, 4)), pose_grid(2, table_angles=QUARTERS[:2])):
-        x = project_ball(scanner, T_HT=setup.T_HT, T_MH=poses.T_MH, t=setup.t, alpha=alpha_of(poses))
+        x = project_ball(scanner, T_HT=setup.T_HT, T_MH=poses.T_MH, t=setup.t, alpha=poses.alpha)
         seen = BallObservations.from_sigma(x, DETECTION_PX / np.sqrt(2), pose_id=poses.pose_id)
         found = calibrate(scanner, poses, seen, model="rigid", hypotheses=False, pose_noise=None)
         u.append(1e3 * sigmas_of(found)["t_HT_x"])

@@ -28,7 +28,7 @@ from tomopose.studies.parts.result import Progress, Scale, StudyCheck, StudyRow,
 from tomopose.studies.parts.steps import Steps
 from tomopose.studies.parts.virtual_hexapod import REPEATABILITY, ball_run, matrices_error_um, real_T_MH, scan_of
 from tomopose.studies.section6.calibrations import GRID, kinematic, planned_run, projected, rigid
-from tomopose.studies.section6.scan import Numbers, Radiographs, Scan, alpha_of, scan_with
+from tomopose.studies.section6.scan import Numbers, Radiographs, Scan, scan_with
 from tomopose.studies.section6.specimen import azimuth, cylinder_areas, reference
 from tomopose.studies.section6.tables import PERIODS, deviations_of, rms, waves
 from tomopose.studies.section6.volumes import Case, measured
@@ -165,7 +165,7 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
     cases = by_name(scan, path, coarse, seed)
     fine = paper_scanner(MAGNIFICATION)
     P_true = eq5_matrices(
-        fine, T_HT=demo_setup(paper=True).T_HT, T_MH=real_T_MH(scan.poses, MAGNIFICATION), alpha=alpha_of(scan.poses)
+        fine, T_HT=demo_setup(paper=True).T_HT, T_MH=real_T_MH(scan.poses, MAGNIFICATION), alpha=scan.poses.alpha
     )
     error = {name: matrices_error_um(P.P, P_true, fine) for name, (P, _) in cases.items()}
     images = Radiographs(scan, steps.folder)

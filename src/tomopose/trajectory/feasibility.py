@@ -60,7 +60,6 @@ class TravelLimits:
 
 def travel(poses: PoseSequence) -> Array:
     """Axis values (n, 7) of poses: x, y, z (mm), angles of R_x R_y R_z and table angle (rad)."""
-    assert poses.alpha is not None
     return np.column_stack([poses.T_MH.t, poses.T_MH.angles, poses.alpha])
 
 
@@ -129,7 +128,6 @@ def ball_outline(
     Multiple View Geometry, secs. 3.2 and 8.3).
     """
     T_HT.require(Frame.H, Frame.T)
-    assert poses.alpha is not None
     c_T = T_HT.apply((poses.T_MH.R @ np.asarray(t, dtype=np.float64)) + poses.T_MH.t)
     T_TW = scanner.T_TW(poses.alpha)
     c = (T_TW.R @ c_T[:, :, None])[..., 0] + T_TW.t
@@ -160,7 +158,6 @@ def collisions(
 
     Points only: give them as densely as the box is thick.
     """
-    assert poses.alpha is not None
     x_T = T_HT.require(Frame.H, Frame.T).apply(poses.T_MH.apply(x_M).reshape(-1, 3)).reshape(len(poses), -1, 3)
     T_TW = scanner.T_TW(poses.alpha)
     x_W = np.einsum("nij,nmj->nmi", T_TW.R, x_T) + T_TW.t[:, None]

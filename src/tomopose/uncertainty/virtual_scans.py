@@ -152,7 +152,7 @@ def drawn_matrices(
     The object's pose under them is the true one as nearly as it can be, over `grid`.  Errors as `simulated_errors`.
     """
     scanner = run.scanner
-    alpha = np.zeros(len(run)) if run.poses.alpha is None else run.poses.alpha
+    alpha = run.poses.alpha
     if calibration is None:
         P = eq5_matrices(scanner, T_HT=run.T_HT, T_MH=run.poses.T_MH, alpha=alpha)
     else:

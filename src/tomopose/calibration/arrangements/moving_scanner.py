@@ -60,22 +60,8 @@ def calibrate_inverse(
     ------
     As `calibrate`; NotObservableError for what says only where W begins.
     """
-    if np.asarray(poses.alpha).any():
-        raise InputError("the arrangement with a fixed object has no rotary table; alpha must be 0 in every pose")
-    if not (np.isfinite(d_SD_sigma) and d_SD_sigma >= 0):
-        raise InputError(f"d_SD_sigma is {d_SD_sigma}; a standard deviation >= 0 in mm is needed")
-    if d_SD_sigma and model == "slack":
-        raise InputError(
-            "a d_SD that differs from view to view cannot be distinguished from poses that scatter (model slack)"
-        )
     free, auto = freed_names(free)
-    for name in free:
-        if name == "d_SR" or name.startswith("axis"):
-            raise NotObservableError(
-                f"{name} says only where W begins on a scanner that moves as a whole; no image depends on it beside "
-                "the mount",
-                direction=name,
-            )
+    _require_determinable(poses, model, d_SD_sigma, free)
     machine = machine_of(manipulator)
     if distances and (model == "rigid" or (model == "auto" and machine is None)):
         raise InputError("distances between balls serve models with the manipulator's errors; give its geometry")
@@ -120,6 +106,25 @@ def calibrate_inverse(
     d_SD, u = view_distances(found, poses, seen, d_SD_sigma=d_SD_sigma)
     views = ViewDistances(sigma=d_SD_sigma, pose_id=tuple(seen.pose_id), d_SD=d_SD, u=u)
     return replace(found, views=views)
+
+
+def _require_determinable(poses: PoseSequence, model: str, d_SD_sigma: float, free: Sequence[str]) -> None:
+    """InputError or NotObservableError for what this arrangement does not have or cannot determine."""
+    if np.asarray(poses.alpha).any():
+        raise InputError("the arrangement with a fixed object has no rotary table; alpha must be 0 in every pose")
+    if not (np.isfinite(d_SD_sigma) and d_SD_sigma >= 0):
+        raise InputError(f"d_SD_sigma is {d_SD_sigma}; a standard deviation >= 0 in mm is needed")
+    if d_SD_sigma and model == "slack":
+        raise InputError(
+            "a d_SD that differs from view to view cannot be distinguished from poses that scatter (model slack)"
+        )
+    for name in free:
+        if name == "d_SR" or name.startswith("axis"):
+            raise NotObservableError(
+                f"{name} says only where W begins on a scanner that moves as a whole; no image depends on it beside "
+                "the mount",
+                direction=name,
+            )
 
 
 def view_distances(

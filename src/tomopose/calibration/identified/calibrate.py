@@ -79,15 +79,11 @@ def calibrate_kinematic(
     Raises
     ------
     InputError         a manipulator that does not fit, balls mixed up.
-    OutOfReachError    poses that the platform cannot reach.
-    TrajectoryError    singular poses.
+    TrajectoryError    poses that the platform cannot reach (OutOfReachError), singular poses.
     NotConvergedError  no optimum.
     """
-    if model not in MODELS:
-        raise InputError(f"unknown model {model!r}; known are {', '.join(MODELS)}")
     machine = machine_of(manipulator)
-    if machine is None and model == "kinematic":
-        raise InputError("model 'kinematic' needs the manipulator's nominal geometry (hexapod.json or robot.json)")
+    _require_model(model, machine)
     data = pair(scanner, poses, observations)
     freed = _freed_as(rigid, data) if free is None else free
     problem = KinematicProblem(
@@ -105,13 +101,8 @@ def calibrate_kinematic(
         delta=_freed_values(rigid, freed) - freed.value,
         p=np.zeros(0),
     )
-    candidates: list[tuple[str, ErrorModel | None]] = [("rigid", None)]
-    if model == "kinematic" or (model == "auto" and machine is not None):
-        candidates.append(("kinematic", machine))
-    if model == "slack":
-        candidates += map_candidates(problem, start)
     needed = "kinematic" if model == "kinematic" else "rigid"
-    fits = _fit_all(problem, start, candidates, robust, needed=needed, widen=auto)
+    fits = _fit_all(problem, start, _candidates(model, machine, problem, start), robust, needed=needed, widen=auto)
     best = max(fits.values(), key=lambda f: f.estimate.log_evidence)
     require_balls_not_swapped(best, problem)
     found = {name: judged(name, fit) for name, fit in fits.items()}
@@ -133,6 +124,25 @@ def calibrate_kinematic(
         assumed=rigid.assumed,
         provenance=provenance(arguments={**earlier, "model": model}),
     )
+
+
+def _require_model(model: str, machine: ErrorModel | None) -> None:
+    if model not in MODELS:
+        raise InputError(f"unknown model {model!r}; known are {', '.join(MODELS)}")
+    if machine is None and model == "kinematic":
+        raise InputError("model 'kinematic' needs the manipulator's nominal geometry (hexapod.json or robot.json)")
+
+
+def _candidates(
+    model: str, machine: ErrorModel | None, problem: KinematicProblem, start: State
+) -> list[tuple[str, ErrorModel | None]]:
+    """The error models among which the data choose, simplest first."""
+    candidates: list[tuple[str, ErrorModel | None]] = [("rigid", None)]
+    if model == "kinematic" or (model == "auto" and machine is not None):
+        candidates.append(("kinematic", machine))
+    if model == "slack":
+        candidates += map_candidates(problem, start)
+    return candidates
 
 
 def _scale_of(rigid: Calibration) -> float:

@@ -153,6 +153,21 @@ def _balls(poses: PoseSequence, observations: BallObservations, rows: Array, k: 
     return np.asarray(seen)
 
 
+def _common_pivot(
+    poses: Sequence[PoseSequence], observations: Sequence[BallObservations], scanners: Sequence[Scanner]
+) -> Array | None:
+    """The pivot of all runs, (3,) mm, or None where none is stated; InputError where the runs do not fit together."""
+    if len(poses) != len(observations):
+        raise InputError(f"{len(poses)} pose tables but {len(observations)} sets of observations; each run needs both")
+    if len(scanners) != len(poses):
+        raise InputError(f"{len(scanners)} scanners for {len(poses)} runs; give one, or one for each run")
+    pivots = [p.pivot for p in poses if p.pivot is not None]
+    for other in pivots[1:]:
+        if np.abs(other - pivots[0]).max() > PIVOT_TOLERANCE_MM:
+            raise InputError(f"the runs have different pivots, {pivots[0]} and {other} mm; H differs between them")
+    return pivots[0] if pivots else None
+
+
 def pair(
     scanner: Scanner | Sequence[Scanner],
     poses: PoseSequence | Sequence[PoseSequence],
@@ -168,16 +183,9 @@ def pair(
     """
     runs_p, runs_o = _as_runs(poses, PoseSequence), _as_runs(observations, BallObservations)
     scanners = _as_runs(scanner, Scanner)
-    if len(runs_p) != len(runs_o):
-        raise InputError(f"{len(runs_p)} pose tables but {len(runs_o)} sets of observations; each run needs both")
     if len(scanners) == 1:
         scanners = scanners * len(runs_p)
-    if len(scanners) != len(runs_p):
-        raise InputError(f"{len(scanners)} scanners for {len(runs_p)} runs; give one, or one for each run")
-    pivots = [p.pivot for p in runs_p if p.pivot is not None]
-    for other in pivots[1:]:
-        if np.abs(other - pivots[0]).max() > PIVOT_TOLERANCE_MM:
-            raise InputError(f"the runs have different pivots, {pivots[0]} and {other} mm; H differs between them")
+    pivot = _common_pivot(runs_p, runs_o, scanners)
     several = len(runs_p) > 1
     parts: dict[str, list[Any]] = {k: [] for k in ("R", "t", "alpha", "run", "index", "ball", "x", "C", "outline")}
     ids: list[str] = []
@@ -230,7 +238,7 @@ def pair(
         pose_id=tuple(ids),
         not_seen=not_seen,
         time_utc=tuple(times) if len(times) == n else None,
-        pivot=pivots[0] if pivots else None,
+        pivot=pivot,
         convention=runs_p[0].convention,
         orientations=_written_orientations(runs_p, parts["index"]),
         units_confirmed=all(p.units_confirmed for p in runs_p),

@@ -32,7 +32,7 @@ def d_exact(
         if missing:
             raise InputError(f"no exact centre is given for ball {missing[0]}")
         t = np.array([t[int(b)] for b in rows.ball_id])
-    exact = project_ball(scanner, T_HT=T_HT, T_MH=rows.T_MH, t=t, alpha=0.0 if rows.alpha is None else rows.alpha)
+    exact = project_ball(scanner, T_HT=T_HT, T_MH=rows.T_MH, t=t, alpha=rows.alpha)
     result: Array = np.linalg.norm(used.x_D - exact, axis=1)
     return result
 

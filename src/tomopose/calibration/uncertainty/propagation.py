@@ -43,10 +43,6 @@ def field_of_view_points(scanner: Scanner, share: float = 0.8) -> Array:
     return np.concatenate([[[0.0, 0.0, z.mean()]], corners])
 
 
-def _alpha(poses: PoseSequence) -> Array:
-    return np.zeros(len(poses)) if poses.alpha is None else poses.alpha
-
-
 def matrix_point_jacobian(calibration: Calibration, poses: PoseSequence, x_W: Array) -> Array:
     """(n, m, 2, c): derivatives of the pixels of points x_W (m, 3), under eq. (5), by the coordinates of `tangent`."""
     names, scanner = calibration.tangent, calibration.scanner
@@ -60,7 +56,7 @@ def matrix_point_jacobian(calibration: Calibration, poses: PoseSequence, x_W: Ar
     free = [(j, base_name(name)) for j, name in enumerate(names) if base_name(name) in _ACTS]
     A = R @ T.R @ R.T
     for i in range(m):
-        b = projection_blocks(scanner, T_HT=calibration.T_HT, T_MH=T, t=x_M[i], alpha=_alpha(poses))
+        b = projection_blocks(scanner, T_HT=calibration.T_HT, T_MH=T, t=x_M[i], alpha=poses.alpha)
         G = b.J_t_HT
         x_out = b.x_H @ R.T
         result[:, i, :, :3] = -G @ skew(x_out) + G @ A @ skew(home[i] - t_HT)
@@ -96,7 +92,7 @@ def apparent_displacement(calibration: Calibration, poses: PoseSequence, x_W: Ar
     """
     x = np.asarray(x_W, dtype=np.float64)
     J = matrix_point_jacobian(calibration, poses, x)
-    P = eq5_matrices(calibration.scanner, T_HT=calibration.T_HT, T_MH=poses.T_MH, alpha=_alpha(poses))
+    P = eq5_matrices(calibration.scanner, T_HT=calibration.T_HT, T_MH=poses.T_MH, alpha=poses.alpha)
     h = np.einsum("nij,mj->nmi", P[:, :, :3], x) + P[:, None, :, 3]
     G = (P[:, None, :2, :3] - (h[..., :2] / h[..., 2:])[..., None] * P[:, None, 2:, :3]) / h[..., 2:, None]
     N = np.einsum("nmia,nmib->mab", G, G)
@@ -119,7 +115,7 @@ def scan_displacement(calibration: Calibration, poses: PoseSequence, x_W: ArrayL
     x = np.asarray(x_W, dtype=np.float64)
     J, C = scan_jacobian(calibration, poses, plate_points(calibration, x))
     T_MH = correction(calibration.errors, poses).poses.T_MH
-    P = eq5_matrices(calibration.scanner, T_HT=calibration.T_HT, T_MH=T_MH, alpha=_alpha(poses))
+    P = eq5_matrices(calibration.scanner, T_HT=calibration.T_HT, T_MH=T_MH, alpha=poses.alpha)
     if not np.isfinite(pixels(P, x)).all():
         raise InputError("points of the part have no image in some views; are these the scan's poses?")
     G = point_jacobian(P, x)

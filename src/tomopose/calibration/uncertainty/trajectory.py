@@ -111,7 +111,7 @@ def _columns(calibration: Calibration, poses: PoseSequence, x_M: Array) -> tuple
     J = np.zeros((n, m, 2, c + (0 if unseen is None else len(unseen.names))))
     freed = [(j, name.split("[")[0]) for j, name in enumerate(names)]
     errors = [names.index(name) for name in fixed.names]
-    alpha = np.zeros(n) if poses.alpha is None else poses.alpha
+    alpha = poses.alpha
     # every pose with every point, poses first: one projection of all of them
     pose = np.repeat(np.arange(n), m)
     x = np.tile(x_M, (n, 1))

@@ -144,7 +144,7 @@ def rotation_map(joined: Joined) -> Figure | None:
 
 def table_angles(joined: Joined) -> Figure | None:
     """Table angles as a dial; None without poses."""
-    if joined.poses is None or joined.poses.alpha is None:
+    if joined.poses is None:
         return None
     degrees = np.round(np.degrees(joined.poses.alpha) % 360.0, 3)
     values, counts = np.unique(degrees, return_counts=True)

@@ -189,7 +189,7 @@ def _running_median(values: Array, width: int) -> Array:
 def by_coordinate(joined: Joined) -> Figure | None:
     """Residuals against every coordinate of the pose, the table angle and time; None without poses."""
     poses = joined.poses
-    if poses is None or poses.alpha is None:
+    if poses is None:
         return None
     angles = np.degrees(poses.T_MH.angles)
     columns: list[tuple[str, Array]] = [(f"{n} / mm", poses.T_MH.t[:, k]) for k, n in enumerate("xyz")]

@@ -92,7 +92,7 @@ def manipulator_in_world(calibration: Calibration) -> RigidTransform:
 def ball_in_world(calibration: Calibration, joined: Joined) -> Array | None:
     """Ball centres (n, 3) in W, mm, of the poses used; None without poses."""
     poses = joined.poses
-    if poses is None or poses.alpha is None:
+    if poses is None:
         return None
     t = np.array([calibration.balls.get(int(b), calibration.t) for b in poses.ball_id])
     x_T = calibration.T_HT.apply((poses.T_MH.R @ t[:, :, None])[..., 0] + poses.T_MH.t)

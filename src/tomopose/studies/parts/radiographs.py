@@ -47,7 +47,7 @@ class BallRun:
     @property
     def alpha(self) -> Array:
         """Table angles (n,), rad."""
-        return np.zeros(len(self.poses)) if self.poses.alpha is None else self.poses.alpha
+        return self.poses.alpha
 
     @property
     def x_D(self) -> Array:

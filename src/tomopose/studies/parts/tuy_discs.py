@@ -57,7 +57,7 @@ def disc_profile(scan: PoseSequence, scale: Scale) -> dict[str, Any]:
     """z (n,), value on the discs' axis (mean of a core of 4 mm radius) over the true one, and the section y = 0."""
     binning, _ = PLAN[scale]
     fine = paper_scanner(MAGNIFICATION)
-    alpha = np.zeros(len(scan)) if scan.alpha is None else scan.alpha
+    alpha = scan.alpha
     P = eq5_matrices(fine, T_HT=demo_setup(paper=True).T_HT, T_MH=scan.T_MH, alpha=alpha)
     matrices = ProjectionMatrices(
         P=P, n_u=fine.n_u, n_v=fine.n_v, p_u=fine.p_u, p_v=fine.p_v, pose_id=scan.pose_id, scanner=fine

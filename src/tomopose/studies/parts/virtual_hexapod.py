@@ -98,7 +98,7 @@ def scan_error_um(calibration: Calibration, run: BallRun, magnification: float) 
         run.scanner,
         T_HT=run.T_HT,
         T_MH=real_T_MH(scan, magnification),
-        alpha=np.zeros(len(scan)) if scan.alpha is None else scan.alpha,
+        alpha=scan.alpha,
     )
     return matrices_error_um(projection_matrices(calibration, scan).P, P_true, run.scanner)
 

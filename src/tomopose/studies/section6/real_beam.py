@@ -16,7 +16,7 @@ from tomopose.studies.demo import demo_setup, paper_scanner
 from tomopose.studies.parts.result import Progress, StudyCheck, StudyRow, check_below
 from tomopose.studies.parts.steps import Steps
 from tomopose.studies.section6.calibrations import Method
-from tomopose.studies.section6.scan import MAGNIFICATION, Numbers, Path, Radiographs, Scan, alpha_of
+from tomopose.studies.section6.scan import MAGNIFICATION, Numbers, Path, Radiographs, Scan
 from tomopose.studies.section6.specimen import azimuth, cuboid_areas, cylinder_areas
 from tomopose.studies.section6.tables import PERIODS, Found, deviations, largest, rms, row, waves
 from tomopose.studies.section6.volumes import Case, matrices_for, measured
@@ -35,7 +35,7 @@ def circular_matrices(scan: Scan, seed: int) -> ProjectionMatrices:
     rng = np.random.default_rng(np.random.SeedSequence([seed, 13]))
     full, setup = paper_scanner(MAGNIFICATION[scan.thing]), demo_setup(paper=True)
     off = {name: getattr(full, name) + sigma * float(rng.standard_normal()) for name, sigma in SCANNER_ERRORS.items()}
-    alpha = alpha_of(scan.poses)
+    alpha = scan.poses.alpha
     harmonics = WOBBLE_MM * rng.standard_normal((2, 3))
     moved = np.cos(alpha)[:, None] * harmonics[0] + np.sin(alpha)[:, None] * harmonics[1]
     T_MH = replace(scan.poses.T_MH, t=scan.poses.T_MH.t + moved)

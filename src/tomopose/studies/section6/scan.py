@@ -106,7 +106,7 @@ def scan_with(thing: Object, path: Path, numbers: Numbers, seed: int) -> Scan:
     motion, noise = np.random.SeedSequence([seed, 6, round(10 * m), path == "3D"]).spawn(2)
     T_MH = real_T_MH(poses, m, np.random.default_rng(motion)) if path == "3D" else poses.T_MH
     truth = ProjectionMatrices(
-        P=eq5_matrices(full, T_HT=setup.T_HT, T_MH=T_MH, alpha=alpha_of(poses)),
+        P=eq5_matrices(full, T_HT=setup.T_HT, T_MH=T_MH, alpha=poses.alpha),
         n_u=full.n_u,
         n_v=full.n_v,
         p_u=full.p_u,
@@ -125,11 +125,6 @@ def scan_with(thing: Object, path: Path, numbers: Numbers, seed: int) -> Scan:
         edge=numbers.edge,
         seed=int(noise.generate_state(1)[0]),
     )
-
-
-def alpha_of(poses: PoseSequence) -> Array:
-    """Table angles (n,), rad."""
-    return np.zeros(len(poses)) if poses.alpha is None else np.asarray(poses.alpha)
 
 
 def grid_of(thing: Object, numbers: Numbers) -> VoxelGrid:
