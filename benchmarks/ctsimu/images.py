@@ -64,21 +64,25 @@ def opaque(content: dict[str, Any]) -> dict[str, Any]:
     return content
 
 
+BAND = (430, 585)
+"""Columns of the panel that are imaged in the wedge tests; beside them the beam is empty."""
+
+
 def wedge_scanner() -> Scanner:
     """1000 x 1000 pixels; the wedge tests depend on no distance, as all rays of a step meet the same thickness."""
     return Scanner(d_SD=1000.0, d_SR=500.0, p_u=0.4, p_v=0.4, u_0=499.5, v_0=499.5, n_u=1000, n_v=1000)
 
 
-def wedge_run(solids: tuple[Solid, ...], spectrum: Spectrum) -> SimulatedRun:
+def wedge_run(solids: tuple[Solid, ...], spectrum: Spectrum, *, cells: int = 2) -> SimulatedRun:
     still = PoseSequence.from_table([[0, 0, 0]], [[0, 0, 0]])
     return SimulatedRun(
-        scanner=wedge_scanner(),
+        scanner=wedge_scanner().cropped(u=BAND[0], v=0, n_u=BAND[1] - BAND[0], n_v=1000),
         poses=still,
         T_HT=RigidTransform.identity(Frame.H, Frame.T),
         T_MH=still.T_MH,
         solids=solids,
         spectrum=spectrum,
-        detector=Detector(snr=math.inf, blur_sigma=0.0, white=WHITE),
+        detector=Detector(snr=math.inf, blur_sigma=0.0, white=WHITE, cells=cells),
         materials=wedge_materials(),
         seed=1,
     )
@@ -90,9 +94,19 @@ def wedge_materials() -> dict[str, Material]:
     return {**MATERIALS, **{name: from_formula(name, density) for name, density in formulas.items()}}
 
 
-def write(folder: Path, name: str, run: SimulatedRun, *, flat: bool = True, threads: int = 1) -> str:
-    """The metadata file of a run's only projection, written beside it and its noise-free flat image."""
-    tifffile.imwrite(folder / f"{name}.tif", render(run, 0, threads=threads)[::-1])
+def write(
+    folder: Path, name: str, run: SimulatedRun, *, flat: bool = True, threads: int = 1, whole: Scanner | None = None
+) -> str:
+    """The metadata file of a run's only projection, written beside it and its noise-free flat image.
+
+    whole: the panel of which the run images the columns `BAND`; the others see the empty beam.
+    """
+    image = render(run, 0, threads=threads)
+    if whole is not None:
+        image, part = np.full(whole.shape, round(run.detector.white), image.dtype), image
+        image[:, BAND[0] : BAND[1]] = part
+        run = replace(run, scanner=whole)
+    tifffile.imwrite(folder / f"{name}.tif", image[::-1])
     if flat:
         quiet = replace(run.detector, snr=math.inf)
         empty = expose(np.ones(run.scanner.shape), quiet, run.scanner, seed=run.seed, frame=0)

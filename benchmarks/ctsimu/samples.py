@@ -29,7 +29,7 @@ STEP = 1000 / 11
 HOLES = ((-160, -140), *((y, z) for z in (205, 0, -205) for y in (205, 0, -205)))
 """Centres (y, z) of the holes' shadows on the panel before scanner and foil are turned, mm; the first hole is large."""
 EDGE_ANGLE = math.radians(3)
-LEFT, RIGHT = 420.0, 600.0
+LEFT, RIGHT = 440.0, 575.0
 """Sides of the wedges in the image, px: the tests look at x = 450 to 565, and a narrow wedge is imaged faster."""
 
 

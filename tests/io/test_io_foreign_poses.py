@@ -402,3 +402,55 @@ def test_a_format_that_is_asked_for_and_not_there_is_refused(write):
         tp.read_pose_log(write("a.txt", "x"), format="kuko")
     with pytest.raises(InputError):
         tp.read_pose_log(write("a.txt", "hello\n"), format="fanuc")
+
+
+def test_positions_that_a_kuka_controller_was_asked_for(write):
+    path = write(
+        "log.txt",
+        "2025-03-02 10:11:12.125; $POS_ACT={E6POS: X 852.5, Y 12.25, Z 640.0, A 1.0, B 2.0, C 3.0, S 2, T 10}\n"
+        "connection kept alive\n"
+        "2025-03-02 10:11:14.125; $POS_ACT={E6POS: X 853.5, Y 12.25, Z 640.0, A 1.0, B 2.5, C 3.0, S 2, T 10}\n",
+    )
+    log = tp.read_pose_log(path)
+    assert log.convention == "kuka"
+    assert log.rows == (
+        ("852.5", "12.25", "640.0", "1.0", "2.0", "3.0"),
+        ("853.5", "12.25", "640.0", "1.0", "2.5", "3.0"),
+    )
+    np.testing.assert_allclose(np.diff(log.seconds), 2.0)
+
+
+def test_a_move_to_the_joint_angles_of_a_pose_goes_to_that_pose(write):
+    text = (
+        "def prog():\n  set_tcp(p[0.0,0.0,0.15,0.0,0.0,0.0])\n  global wp_1_p=p[-.2401,.3101,.4501,1.2,-1.1,.5]\n"
+        "  movej(get_inverse_kin(wp_1_p, qnear=[0,0,0,0,0,0]), a=1.4, v=1.05)\nend\n"
+    )
+    (row,) = tp.read_pose_log(write("a.script", text)).rows
+    assert [float(w) for w in row] == [-240.1, 310.1, 450.1, 1.2, -1.1, 0.5]
+
+
+def test_bracketed_tcp_poses_are_read_where_the_format_is_said(write):
+    path = write("tcp.txt", "[0.1001, 0.2, 0.3, 0.0, 3.1, 0.1]\n[0.1101, 0.2, 0.3, 0.0, 3.0, 0.1]\n")
+    log = tp.read_pose_log(path, format="ur")
+    assert [float(w) for w in log.rows[1]] == [110.1, 200.0, 300.0, 0.0, 3.0, 0.1]
+    with pytest.raises(InputError):
+        tp.read_pose_log(path)
+
+
+def test_a_terminal_s_prompt_is_no_part_of_the_query(write):
+    reply = "X=1.25\nY=-0.5\nZ=2.0\nU=0.1\nV=-0.2\nW=3.0\n"
+    log = tp.read_pose_log(write("t.txt", f"C-887>POS? X Y Z U V W\n{reply}C-887>POS? X Y Z U V W\n{reply}"))
+    assert log.rows == (("1.25", "-0.5", "2.0", "0.1", "-0.2", "3.0"),) * 2
+
+
+def test_matrices_by_named_columns_and_units_of_a_json_object(write):
+    header = "name_less,r11,r12,r13,tx,r21,r22,r23,ty,r31,r32,r33,tz"
+    table = write("m.csv", f"{header}\n0,1,0,0,10,0,1,0,20,0,0,1,30\n1,0,-1,0,11,1,0,0,20,0,0,1,30\n")
+    for path, units in (
+        (table, "mm"),
+        (write("m.json", '{"units": "mm", "poses": [[[1,0,0,10],[0,1,0,20],[0,0,1,30],[0,0,0,1]],'
+                         '[[0,-1,0,11],[1,0,0,20],[0,0,1,30],[0,0,0,1]]]}'), None),
+    ):  # fmt: skip
+        poses = tp.read_pose_log(path, units=units).poses()
+        np.testing.assert_allclose(poses.T_MH.t, [[10, 20, 30], [11, 20, 30]])
+        np.testing.assert_allclose(poses.T_MH.R[1], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)

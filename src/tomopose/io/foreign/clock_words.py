@@ -11,6 +11,10 @@ import numpy as np
 from tomopose.io.foreign.pose_log import ABSOLUTE
 from tomopose.units import Array
 
+STAMP = re.compile(
+    r"^\s*\[?(?P<stamp>(?:\d{4}-\d{2}-\d{2}[ T]|\d{2}\.\d{2}\.\d{4} )?\d{1,2}:\d{2}:\d{2}(?:[.,]\d+)?)\]?[,;\s]+"
+)
+"""A time stamp at the beginning of a line."""
 TIME_OF_DAY = re.compile(r"(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)")
 GERMAN_DATE = re.compile(r"(\d{2})\.(\d{2})\.(\d{4})([ T].*)")
 UNIX_SECONDS = (9e8, 5e9)

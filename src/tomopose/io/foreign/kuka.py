@@ -1,4 +1,4 @@
-"""KUKA: KRL programs (.src), point lists (.dat) and RSI telegrams (.xml).  X Y Z in mm, A B C in deg.
+"""KUKA: KRL programs (.src), point lists (.dat), logs of $POS_ACT and RSI telegrams (.xml).  X Y Z in mm, A B C in deg.
 
 R = R_z(A) R_y(B) R_x(C), moved axes; the pose is the tool's in the active base.  Source: KUKA System Software,
 programming manual for integrators (E6POS, FRAME, LIN, PTP); KUKA.RobotSensorInterface (RIst, RSol, IPOC).
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tomopose.errors import FileError, InputError
+from tomopose.io.foreign.clock_words import STAMP, iso_words, seconds_of
 from tomopose.io.foreign.foreign_file import ForeignFile
 from tomopose.io.foreign.kind import Kind
 from tomopose.io.foreign.number_words import number_word, pairs_of
@@ -29,6 +30,10 @@ MOVE = re.compile(r"^\s*(?P<kind>S?PTP|S?LIN|S?CIRC|SPL)(?P<relative>_REL)?\s+(?
 INLINE = re.compile(r"\{\s*(?:E?[36]?(?:POS|AXIS)|FRAME)?\s*:?([^{}]*)\}", re.IGNORECASE)
 FOLD = re.compile(r"Tool\[(?P<tool>\d+)\].*?Base\[(?P<base>\d+)\]", re.IGNORECASE)
 TELEGRAM = re.compile(r"<Rob\b.*?</Rob>", re.DOTALL)
+RECORD = re.compile(
+    r"\$POS_(?:ACT|ACT_MES|FOR)\s*[=:]?\s*\{(?:\s*(?:E[36]?POS|FRAME)\s*:)?(?P<body>[^{}]*)\}", re.IGNORECASE
+)
+"""A position that was read from the controller: `$POS_ACT={E6POS: X .., Y .., Z .., A .., B .., C ..}`."""
 HOME = re.compile(r"X?HOME\d*|\$\w+", re.IGNORECASE)
 
 
@@ -48,6 +53,8 @@ def recognise(file: ForeignFile) -> bool:
     text = file.text
     if "<Rob" in text and "<RIst" in text:
         return True
+    if RECORD.search(text):
+        return True
     krl = file.suffix in (".src", ".dat", ".sub") or re.search(r"^\s*(&ACCESS|DEFDAT|DEF)\b", text, re.MULTILINE)
     return bool(krl and any(DECLARATION.match(line) or MOVE.match(line) for line in file.lines))
 
@@ -56,6 +63,8 @@ def read(file: ForeignFile, options: PoseOptions) -> PoseLog:
     """The poses of a KRL program, a point list or a stream of RSI telegrams."""
     if "<RIst" in file.text:
         return _telegrams(file)
+    if any(RECORD.search(line) for line in file.lines) and not any(MOVE.match(line) for line in file.lines):
+        return _records(file)
     return _program(file)
 
 
@@ -201,6 +210,29 @@ def _assigned_frames(file: ForeignFile) -> str:
     return "; ".join(said)
 
 
+def _records(file: ForeignFile) -> PoseLog:
+    """The positions of a log of `$POS_ACT`, with the time stamps that begin its lines."""
+    rows, lines, stamps = [], [], []
+    for number, line in enumerate(file.lines, start=1):
+        if found := RECORD.search(line):
+            rows.append(_row(pairs_of(found["body"], r"\s"), FRAME, f"{file.path}: line {number}"))
+            lines.append(number)
+            stamp = STAMP.match(line)
+            stamps.append(stamp["stamp"] if stamp else None)
+    times = tuple(s for s in stamps if s is not None)
+    timed = seconds_of(times) if len(times) == len(rows) else None
+    return PoseLog(
+        path=file.path,
+        convention="kuka",
+        rows=tuple(rows),
+        lines=tuple(lines),
+        times=None if timed is None else (iso_words(times) or times),
+        seconds=None if timed is None else timed[0],
+        clock="" if timed is None else timed[1],
+        notes=("$POS_ACT is the measured pose of the active tool in the active base",),
+    )
+
+
 # -- RSI -----------------------------------------------------------------------------------------------------------
 
 
@@ -247,7 +279,7 @@ def _attributes(block: str, tag: str) -> dict[str, str] | None:
 KIND = Kind(
     name="kuka",
     maker="KUKA",
-    what="a KRL program or point list (.src, .dat) or a stream of RSI telegrams (.xml)",
+    what="a KRL program or point list (.src, .dat), a log of $POS_ACT or a stream of RSI telegrams (.xml)",
     recognise=recognise,
     read_poses=read,
 )

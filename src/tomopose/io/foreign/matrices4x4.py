@@ -54,7 +54,7 @@ def read(file: ForeignFile, options: PoseOptions) -> PoseLog:
         raise InputError(f"{file.path} holds no 4 x 4 matrices with a last row 0 0 0 1")
     T, notes = _rows_first(found, file)
     said = UNITS.search(file.text)
-    unit = options.units or (said["unit"].strip(",;").lower() if said else None)
+    unit = options.units or (said["unit"].strip(",;").lower() if said else _json_unit(file))
     if unit is None:
         raise UnitError(
             f"{file.path}: the unit of the translations is not stated; add --units mm (or m), or a line '# units: mm'"
@@ -78,6 +78,15 @@ def read(file: ForeignFile, options: PoseOptions) -> PoseLog:
     return PoseLog(path=file.path, convention=CONVENTION, rows=rows, notes=tuple(notes))
 
 
+def _json_unit(file: ForeignFile) -> str | None:
+    """What a JSON object says under "units" or "unit"."""
+    if not file.text.lstrip().startswith("{"):
+        return None
+    content: Any = parse_json(file.text, file.path)
+    said = content.get("units", content.get("unit"))
+    return said.strip().lower() if isinstance(said, str) else None
+
+
 def _rows_first(T: Array, file: ForeignFile) -> tuple[Array, list[str]]:
     """The matrices with the translation in the last column."""
     if not np.isfinite(T).all():
@@ -98,23 +107,46 @@ def _loaded(file: ForeignFile) -> Array:
 def _text_matrices(file: ForeignFile) -> Array | None:
     """(n, 4, 4) of text: four rows of four numbers, or rows of sixteen (or twelve); None where it is something else."""
     rows: list[list[float]] = []
+    order: list[int] | None = None
     for number, line in enumerate(file.lines, start=1):
         line = line.split("#", 1)[0].strip().strip("[],;")
         if not line:
             continue
         words = re.split(r"[\s,;]+", line.replace("[", " ").replace("]", " ").strip())
         if not all(re.fullmatch(NUM, w) for w in words):
+            if not rows and order is None and (order := _named_elements(words)) is not None:
+                continue
             if rows:
                 raise InputError(f"{file.path}: line {number} is {line[:40]!r}, between rows of numbers")
             return None
         rows.append([float(w) for w in words])
     widths = {len(r) for r in rows}
+    if order is not None:
+        if widths and min(widths) <= max(order):
+            raise InputError(f"{file.path}: a row has {min(widths)} numbers, fewer than the header has columns")
+        top = np.array([[r[k] for k in order] for r in rows]).reshape(-1, 3, 4)
+        return np.concatenate([top, np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(top), 1, 1))], axis=1) if len(top) else None
     if widths == {16}:
         return np.array(rows).reshape(-1, 4, 4)
     if widths != {4} or len(rows) % 4:
         return None
     T = np.array(rows).reshape(-1, 4, 4)
     return T if _is_homogeneous(T) else None
+
+
+def _named_elements(names: list[str]) -> list[int] | None:
+    """Where the twelve elements of [R | t] are, row by row, under a header such as r11, r12, r13, tx; else None."""
+    at = {name.strip("\"'").lower(): k for k, name in enumerate(names)}
+    for letter in "rmt":
+        for base in (1, 0):
+            moved = [
+                (f"{letter}{i + base}{3 + base}", f"t{a}", f"p{a}", a, f"t{i + base}") for i, a in enumerate("xyz")
+            ]
+            wanted = [[(f"{letter}{i + base}{j + base}",) for j in range(3)] + [moved[i]] for i in range(3)]
+            found = [next((at[n] for n in of if n in at), None) for row in wanted for of in row]
+            if None not in found:
+                return [k for k in found if k is not None]
+    return None
 
 
 def _is_homogeneous(T: Array) -> bool:

@@ -30,7 +30,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tomopose.errors import InputError
-from tomopose.io.foreign.clock_words import iso_words, seconds_of
+from tomopose.io.foreign.clock_words import STAMP, iso_words, seconds_of
 from tomopose.io.foreign.foreign_file import ForeignFile
 from tomopose.io.foreign.kind import Kind
 from tomopose.io.foreign.pose_log import PoseLog, PoseOptions, Row
@@ -46,10 +46,9 @@ OTHER_AXES = ("A", "B")
 PIVOT_AXES = (("R", "S", "T"), ("X", "Y", "Z"))
 SETTLED = ("SPI?", "KEN?", "KLN?", "KLS?", "*IDN?")
 CHANGING = ("SPI", "KEN", "KSD", "KSF", "KST", "KSW", "KLN", "KLD", "FRF")
-STAMP = re.compile(
-    r"^\s*\[?(?P<stamp>(?:\d{4}-\d{2}-\d{2}[ T]|\d{2}\.\d{2}\.\d{4} )?\d{1,2}:\d{2}:\d{2}(?:[.,]\d+)?)\]?[,;\s]+"
-)
 DIRECTION = re.compile(r"^(>>|<<|->|<-|(?:TX|RX|SEND|SENT|RECV|RECEIVED)\b:?)\s*", re.IGNORECASE)
+PROMPT = re.compile(r"^[A-Za-z][\w .-]{0,30}>\s*(?=\*?[A-Z]{3}\b)")
+"""What a terminal writes before a command that is typed, as in `PI-E-816>POS?`."""
 LINE_OF_QUERY = re.compile(r">?\s*(\*?[A-Z]{3}\?)(\s.*)?")
 LINE_OF_COMMAND = re.compile(r">?\s*([A-Z]{3})(\s.*)?")
 ASSIGNMENT = re.compile(r"([A-Z])\s*=\s*(\S+)")
@@ -174,10 +173,10 @@ def _words(path: Path, number: int, values: Mapping[str, str]) -> Row:
 
 
 def _bare(line: str) -> tuple[str | None, str]:
-    """The time stamp of a terminal's line, and the line without stamp and direction."""
+    """The time stamp of a terminal's line, and the line without stamp, direction and prompt."""
     stamp = STAMP.match(line)
     rest = line[stamp.end() :] if stamp else line
-    return (stamp["stamp"] if stamp else None), DIRECTION.sub("", rest.strip()).strip()
+    return (stamp["stamp"] if stamp else None), PROMPT.sub("", DIRECTION.sub("", rest.strip())).strip()
 
 
 def _set(column: str) -> str:

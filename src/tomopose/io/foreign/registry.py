@@ -93,7 +93,7 @@ def pose_kind(file: ForeignFile, format: str | None) -> Kind:
         if not asked:
             raise ConventionError(f"unknown format {format!r} of poses; known are {', '.join(readers)}")
         found = next((k for k in asked if k.recognise(file)), None)
-        if found is not None or len(asked) == 1:
+        if found is not None or len(asked) == 1 or (asked[0].name == format and kind_of(file) is pose_table.KIND):
             return found or asked[0]
         raise FileError(f"{file.path} is not of format {format}; {_what_it_is(file, 'poses')}", path=file.path)
     kind = kind_of(file)

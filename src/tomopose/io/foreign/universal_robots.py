@@ -20,8 +20,12 @@ from tomopose.io.foreign.program_remarks import Remarks
 
 _N = rf"\s*({NUM})\s*"
 POSE = re.compile(rf"\bp\[{_N},{_N},{_N},{_N},{_N},{_N}\]")
+LIST = re.compile(rf"^[^\[\]]*\[{_N},{_N},{_N},{_N},{_N},{_N}\]\s*$")
+"""Six numbers in brackets, as other languages print get_actual_tcp_pose(); read where format ur is asked for."""
 MOVE = re.compile(r"\b(?:move[jlpc]|servo[jc])\s*\(\s*(?P<to>p\[[^\]]*\]|[A-Za-z_]\w*|\[[^\]]*\]|[^,)]*)")
 ASSIGNED = re.compile(r"^\s*(?:global\s+|local\s+)?(?P<name>\w+)\s*=\s*(?=p\[)")
+SAME_POSE = re.compile(r"\bget_inverse_kin\s*\(\s*(?P<of>p\[[^\]]*\]|[A-Za-z_]\w*)\s*(?:,[^()]*)?\)")
+"""Joint angles of a pose: a move to them goes to that pose."""
 NO_POSE = re.compile(r"\b(set_tcp|set_payload\w*|pose_trans|pose_add|pose_sub|pose_inv|get_inverse_kin)\s*\(")
 LONGEST_REACH_M = 10.0
 """No UR robot reaches further than 2 m; numbers above are millimetres."""
@@ -39,10 +43,11 @@ def read_script(file: ForeignFile, options: PoseOptions) -> PoseLog:
     moves: list[tuple[str, Row | None, int]] = []
     alone: list[tuple[Row, int]] = []
     remarks, left = Remarks(), []
+    pattern = POSE if POSE.search(file.text) else LIST
     for number, line in enumerate(file.lines, start=1):
         remarks.line(line)
-        code = line.split("#", 1)[0]
-        poses = [_row(m, f"{file.path}: line {number}", options) for m in POSE.finditer(code)]
+        code = SAME_POSE.sub(r"\g<of>", line.split("#", 1)[0])
+        poses = [_row(m, f"{file.path}: line {number}", options) for m in pattern.finditer(code)]
         move = MOVE.search(code)
         if move and NO_POSE.search(code):
             raise InputError(
