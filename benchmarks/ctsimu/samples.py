@@ -22,8 +22,11 @@ from tomopose.simulation.scene.ctsimu import STAGE_TO_M
 
 WIRES = (0.8, 0.63, 0.5, 0.4, 0.32, 0.25, 0.2, 0.16, 0.13, 0.1, 0.08, 0.063, 0.05)
 """Diameters of the duplex wires and their gaps, as the toolbox evaluates them (ISO 19232-5)."""
-THICKNESSES = (41.0, 35.89, 30.79, 25.68, 20.58, 15.47, 10.36, 5.26, 0.15)
-"""Steps 1 to 9 of the spherical wedge."""
+ALUMINIUM = (41.0, 35.89, 30.79, 25.68, 20.58, 15.47, 10.36, 5.26, 0.15)
+"""Steps 1 to 9 of the spherical wedge, as documented."""
+IRON = tuple(10.0 - 1.2475 * k for k in range(9))
+"""Steps of the iron wedge, which are not documented: equal steps from 10 to 0.02 mm give the toolbox's Monte Carlo
+reference at 100 keV (10.00, 8.75, 7.50, 6.26, 5.01, 3.76, 2.51, 1.27, 0.02 mm by the law of attenuation)."""
 STEP = 1000 / 11
 """Height of a step in the image, px."""
 HOLES = ((-160, -140), *((y, z) for z in (205, 0, -205) for y in (205, 0, -205)))
@@ -118,13 +121,19 @@ class StepWedge:
         normal *= -np.sign(normal @ self.ray(*inside))
         return half_space().along(normal, t=self.source)
 
-    def step(self, k: int, left: float | tuple[float, float], right: float | tuple[float, float]) -> Shape:
+    def step(
+        self,
+        k: int,
+        left: float | tuple[float, float],
+        right: float | tuple[float, float],
+        steps: tuple[float, ...] = ALUMINIUM,
+    ) -> Shape:
         """Step k (from 1) between x = left and right; a pair gives x at the step's upper and lower end."""
         y_0, y_1 = (10 - k) * STEP, (11 - k) * STEP
         edges = [(x, x) if isinstance(x, (int, float)) else x for x in (left, right)]
         middle = (sum(edges[0]) + sum(edges[1])) / 4, (y_0 + y_1) / 2
         # A box about the step keeps its outline in front of the source.
-        thickness = THICKNESSES[k - 1]
+        thickness = steps[k - 1]
         centre = self.ray(*middle)
         centre *= (self.radius + thickness / 2) / np.linalg.norm(centre)
         shape = box(thickness + 400.0, 700.0, 120.0).placed(t=self.source + centre)
