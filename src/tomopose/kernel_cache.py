@@ -13,6 +13,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 VARIABLE = "NUMBA_CACHE_DIR"
 """numba's own: a folder that the user names in it is used wherever it can be written."""
@@ -95,7 +96,10 @@ def told_of_compiling(told: Callable[[bool], None]) -> Iterator[None]:
     """Calls told(True) when this process begins to compile a kernel and told(False) when it ends; not for kernels that
     are loaded from the cache.
     """
-    from numba.core.event import Event, Listener, register, unregister
+    from numba.core import event as untyped_event
+    from numba.core.event import Event, Listener
+
+    events: Any = untyped_event
 
     class Compiling(Listener):
         """Kernels that call others are compiled one inside the other: only the outermost counts."""
@@ -113,8 +117,8 @@ def told_of_compiling(told: Callable[[bool], None]) -> Iterator[None]:
                 told(False)
 
     listener = Compiling()
-    register("numba:compile", listener)
+    events.register("numba:compile", listener)
     try:
         yield
     finally:
-        unregister("numba:compile", listener)
+        events.unregister("numba:compile", listener)

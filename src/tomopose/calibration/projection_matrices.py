@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.calibration.result import Calibration
 from tomopose.calibration.uncertainty.propagation import field_of_view_points
@@ -85,7 +84,7 @@ def projection_matrices(
     *,
     binning: int = 1,
     scanner: Scanner | None = None,
-    points: Any = None,
+    points: ArrayLike | None = None,
     home: RigidTransform | None = None,
 ) -> ProjectionMatrices:
     """The matrices of a scan, points of W (mm, object at home) to pixels.  Eq. (5).

@@ -95,7 +95,8 @@ def _line_integral(volume: np.ndarray, rays: Rays, d: np.ndarray) -> float:
         low = volume[p] + f_b * (volume[p + s_b] - volume[p])
         high = volume[p + s_a] + f_b * (volume[p + s_a + s_b] - volume[p + s_a])
         total += low + f_a * (high - low)
-    return total * (_length(d, rays.spacing) / abs(d[axis]))
+    integral: float = total * (_length(d, rays.spacing) / abs(d[axis]))
+    return integral
 
 
 @njit(cache=True, nogil=True)

@@ -155,13 +155,15 @@ def _part(geo: Mapping[str, Any], n: int, where: str, turn: Array | None) -> _Po
     if not all(k in centre_json for k in "xyz"):  # null coordinates are there
         raise InputError(f"{where}.center has no x, y, z; parts attached to the stage are not read")
     base, drift = _vector(centre_json, "xyz", n, "mm", f"{where}.center")
-    directions = []
+    directions: dict[str, Array] = {}
     for name in ("vector_u", "vector_w"):
         vector, moved = _vector(_section(geo, name, where), "xyz", n, "", f"{where}.{name}")
         if moved.any():
             raise InputError(f"{where}.{name} drifts; its meaning beside deviations is not settled, it is not read")
-        directions.append(vector)
-    axes = np.repeat(_right_handed(*directions, where, "vector_u", "vector_w")[None], n, axis=0)
+        directions[name] = vector
+    axes = np.repeat(
+        _right_handed(directions["vector_u"], directions["vector_w"], where, "vector_u", "vector_w")[None], n, axis=0
+    )
     if turn is not None:
         axes = axes @ R_z(turn)
     pose = _Pose(centre=np.repeat(base[None], n, axis=0), axes=axes)
@@ -188,7 +190,7 @@ def sample_pose(position: Mapping[str, Any], where: str) -> tuple[Array, Array]:
         vector, drift = _vector(entry, "uvw", 1, "mm" if name == "center" else "", f"{where}.{name}")
         if drift.any():
             raise InputError(f"{where}.{name} drifts; samples that move on the stage are not read")
-        directions.append(vector)
+        directions[name] = vector
     centre, r, t = directions
     pose = _Pose(centre=centre[None], axes=_right_handed(r, t, where, "vector_r", "vector_t")[None])
     for k, deviation in enumerate(_list(position.get("deviations"), f"{where}.deviations")):

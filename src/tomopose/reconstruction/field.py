@@ -256,7 +256,8 @@ class DaskField:
             )
             for i, (a, b) in enumerate(self._bounds)
         ]
-        self._pieces = [future.result() for future in futures]
+        # actors: each method gives a future
+        self._pieces: list[Any] = [future.result() for future in futures]
 
     def _all(self, method: str, *arguments: object, **named: object) -> list[Any]:
         return [answer.result() for answer in [getattr(p, method)(*arguments, **named) for p in self._pieces]]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -240,11 +239,11 @@ def twin_matrices(
     poses: PoseSequence,
     source_poses: PoseSequence,
     *,
-    points: Any = None,
+    points: ArrayLike | None = None,
     binning: int = 1,
     scanner: Scanner | None = None,
 ) -> ProjectionMatrices:
-    """The matrices of a scan by twin robots: points of W, as it stands in the first view, to pixels.
+    """The matrices of a scan by twin robots: points of W, as it is in the first view, to pixels.
 
     poses, source_poses: flanges of detector and source in their own bases, paired by pose_id.  points (m, 3) of W where
     `points_sigma` is predicted, the object's rigid pose removed; by default the field of view of the first view.

@@ -131,7 +131,7 @@ def _as_runs(value: Any, kind: type) -> list[Any]:
     return [value] if isinstance(value, kind) else list(value)
 
 
-def _balls(poses: PoseSequence, observations: BallObservations, rows: Array, k: Array) -> Array:
+def _balls(poses: PoseSequence, observations: BallObservations, rows: np.ndarray, k: np.ndarray) -> Array:
     """(len(rows),) which ball each observed row is of; k: the rows' poses.
 
     A pose table without ball ids has one ball, 0; the observations then say which. InputError where both name balls

@@ -33,7 +33,8 @@ def silhouette_outlines(P: Array, centres: Array, diameter: float) -> Array:
     C = P @ Q @ np.swapaxes(P, 1, 2)
     C = C / C[:, 2:, 2:]
     m = C[:, :2, 2]
-    return np.sqrt(np.maximum(np.linalg.det(m[:, :, None] * m[:, None, :] - C[:, :2, :2]), 0.0))
+    outline: Array = np.sqrt(np.maximum(np.linalg.det(m[:, :, None] * m[:, None, :] - C[:, :2, :2]), 0.0))
+    return outline
 
 
 def size_ratio_of(problem: Problem, P: Array, centres: Array, diameter: float | None = None) -> float | None:

@@ -189,7 +189,7 @@ def _widths(s: Array) -> Array:
     return np.gradient(s) if len(s) > 1 else np.ones(1)
 
 
-def _around(objective: Callable[[Array], float], s: list[Array], k: int, most: float) -> Array:
+def _around(objective: Callable[[float, float], float], s: list[Array], k: int, most: float) -> Array:
     """Values about the likeliest of scatter k, for the other anywhere: a grid from 0 to `most` would step over it."""
     other = s[1 - k]
     coarse = s[k][0] + np.concatenate([[0.0], np.geomspace(s[k][-1] / 400.0, s[k][-1], 12)])

@@ -36,7 +36,7 @@ from tomopose.values import require_types
 
 @require_types
 def detect(
-    images: Iterable[Any],
+    images: Iterable[Image],
     scanner: Scanner,
     *,
     ball_diameter: float | Mapping[int, float],
@@ -104,7 +104,7 @@ class _Run:
     done: rows of an earlier run by name, from the journal.
     """
 
-    images: Iterable[Any]
+    images: Iterable[Image]
     total: int
     work: Work
     diameters: _Diameters
@@ -139,7 +139,7 @@ class _Run:
 
 
 def _run(
-    images: Iterable[Any], scanner: Scanner, *, diameters: _Diameters, pose_id: Iterable[Any] | None,
+    images: Iterable[Image], scanner: Scanner, *, diameters: _Diameters, pose_id: Iterable[Any] | None,
     predicted: npt.ArrayLike | None, origin: tuple[int, int] | Sequence[tuple[int, int]], journal: str | Path | None,
     settings: DetectionSettings,
 ) -> _Run:  # fmt: skip

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dask.distributed import Client
+    pass
 
 
 def ordered_map(
@@ -17,7 +17,7 @@ def ordered_map(
     tasks: Iterable[tuple[Any, ...]],
     *,
     workers: int = 1,
-    executor: Executor | Client | None = None,
+    executor: Any = None,
 ) -> Iterator[tuple[tuple[Any, ...], Any]]:
     """(task, function(*task)) for each task, in order; few tasks are under way at a time, so that few images are held.
 

@@ -42,12 +42,14 @@ class Part:
         from scipy.spatial import ConvexHull
 
         x = self.mesh.points
-        return x[ConvexHull(x).vertices]
+        hull: Array = x[ConvexHull(x).vertices]
+        return hull
 
     @property
     def centre(self) -> Array:
         """(3,) middle of the bounding box, mm."""
-        return (self.mesh.points.min(axis=0) + self.mesh.points.max(axis=0)) / 2
+        centre: Array = (self.mesh.points.min(axis=0) + self.mesh.points.max(axis=0)) / 2
+        return centre
 
     def winding(self, x: Array) -> Array:
         """(m,) 1 where points (m, 3), mm, lie in the material, 0 outside."""
@@ -85,7 +87,8 @@ def _corner_normals(mesh: Mesh) -> Array:
     total = np.zeros((where.max() + 1, 3))
     for k in range(3):
         np.add.at(total, where[:, k], mesh.face_normals)
-    return (total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None])[where]
+    normals: Array = (total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None])[where]
+    return normals
 
 
 def require_simple(part: Part) -> None:

@@ -216,7 +216,7 @@ def reference_images(detector: Detector, scanner: Scanner, seed: int) -> tuple[A
 
 
 @functools.lru_cache(maxsize=2)
-def _reference_images(detector: Detector, panel: tuple[tuple[str, object], ...], seed: int) -> tuple[Any, Any]:
+def _reference_images(detector: Detector, panel: tuple[tuple[str, Any], ...], seed: int) -> tuple[Any, Any]:
     scanner = Scanner(**dict(panel))
     profile = beam_profile(scanner, detector)
     empty = np.ones(scanner.shape) if profile is None else profile

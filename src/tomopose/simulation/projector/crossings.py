@@ -6,6 +6,8 @@ is the difference of two large ones: the error of a path stays below 1 nm even a
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
@@ -27,9 +29,7 @@ def _put(T: np.ndarray, S: np.ndarray, row: int, t_0: float, t_1: float, s_0: in
 
 
 @njit(cache=True, nogil=True)
-def _slab(
-    o: float, d: float, h: float, face: int, lo: float, hi: float, s_lo: int, s_hi: int
-) -> tuple[float, float, int, int]:
+def _slab(o: float, d: float, h: float, face: int, lo: float, hi: float, s_lo: int, s_hi: int) -> Any:
     """Cut the interval (lo, hi) with |o + t d| <= h; faces `face` (at -h) and `face` + 1 (at +h)."""
     if d == 0.0:
         if abs(o) > h:

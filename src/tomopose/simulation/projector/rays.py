@@ -10,7 +10,7 @@ large ones: the error of a path stays below 1 nm even at grazing incidence.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numba import njit
@@ -28,7 +28,7 @@ BUNDLE = 32
 """Rays that are looked at together, to find which solids they can meet at all."""
 LARGEST = 48
 """Most surface crossings on one ray inside one solid; a ray that needs more is an error, never a wrong path."""
-ROW_0, UNION, INTERSECTION, DIFFERENCE = np.int64(0), np.int64(-1), np.int64(-2), np.int64(-3)
+ROW_0, UNION, INTERSECTION, DIFFERENCE = (cast(int, np.int64(k)) for k in (0, -1, -2, -3))
 """A row of crossings, and how two are combined.  numba compiles a function anew for each plain number that it is called
 with; these are values like any other."""
 

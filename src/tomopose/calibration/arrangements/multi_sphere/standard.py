@@ -81,7 +81,7 @@ class SphereStandard:
         a, b, c = _widest_triple(x)
         for i, j in np.argwhere(np.abs(D - D[a, b]) < tolerance):
             for k in np.flatnonzero((np.abs(D[i] - D[a, c]) < tolerance) & (np.abs(D[j] - D[b, c]) < tolerance)):
-                if (i, j, k) == (a, b, c) or len({i, j, k}) < 3:
+                if [i, j, k] == [a, b, c] or len({i, j, k}) < 3:
                     continue
                 R, t = rigid_motion(x[[a, b, c]], x[[i, j, k]])
                 apart = np.linalg.norm((x @ R.T + t)[:, None] - x[None], axis=2)

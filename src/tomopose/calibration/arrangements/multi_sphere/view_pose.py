@@ -12,6 +12,7 @@ from itertools import permutations, product
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tomopose.calibration.arrangements.multi_sphere.standard import FEWEST_BALLS
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks, whiteners
@@ -41,7 +42,12 @@ class BallPose:
 
 @require_types
 def pose_from_balls(
-    scanner: Scanner, x_D: Any, balls: Any, *, covariance: Any = None, start: RigidTransform | None = None
+    scanner: Scanner,
+    x_D: ArrayLike,
+    balls: ArrayLike,
+    *,
+    covariance: ArrayLike | None = None,
+    start: RigidTransform | None = None,
 ) -> BallPose:
     """The object's pose M -> W from observed centres x_D (m, 2), px, of balls (m, 3), mm in M.
 
@@ -53,13 +59,13 @@ def pose_from_balls(
     NotObservableError   balls in a line, or in another arrangement that leaves the pose open.
     NotConvergedError    no pose projects the balls where they were seen.
     """
-    x_D, balls = np.asarray(x_D, dtype=np.float64), np.asarray(balls, dtype=np.float64)
-    m = len(balls)
-    if x_D.shape != (m, 2) or balls.shape != (m, 3):
-        raise InputError(f"observed centres (m, 2) and balls (m, 3) must pair; got {x_D.shape} and {balls.shape}")
+    x, x_M = np.asarray(x_D, dtype=np.float64), np.asarray(balls, dtype=np.float64)
+    m = len(x_M)
+    if x.shape != (m, 2) or x_M.shape != (m, 3):
+        raise InputError(f"observed centres (m, 2) and balls (m, 3) must pair; got {x.shape} and {x_M.shape}")
     if m < FEWEST_BALLS:
         raise InputError(f"{m} balls do not determine a pose; at least {FEWEST_BALLS} are needed")
-    spread = np.linalg.svd(balls - balls.mean(axis=0), compute_uv=False)
+    spread = np.linalg.svd(x_M - x_M.mean(axis=0), compute_uv=False)
     if spread[1] < 1e-6 * spread[0]:
         raise NotObservableError(
             "the balls are in a line: a turn about it moves none of them",
@@ -68,10 +74,10 @@ def pose_from_balls(
         )
     C = np.tile(np.eye(2), (m, 1, 1)) if covariance is None else np.asarray(covariance, dtype=np.float64)
     W = whiteners(C)
-    starts = [start] if start is not None else _coarse_starts(scanner, x_D, balls)
-    coarse = [_gauss_newton(scanner, x_D, balls, W, s, START_STEPS if len(starts) > 1 else STEPS) for s in starts]
+    starts = [start] if start is not None else _coarse_starts(scanner, x, x_M)
+    coarse = [_gauss_newton(scanner, x, x_M, W, s, START_STEPS if len(starts) > 1 else STEPS) for s in starts]
     best = min(coarse, key=lambda found: found[1])
-    T, chi2, J, r, still = _gauss_newton(scanner, x_D, balls, W, best[0], STEPS)
+    T, chi2, J, r, still = _gauss_newton(scanner, x, x_M, W, best[0], STEPS)
     if not np.isfinite(chi2) or not still:
         raise NotConvergedError("no pose of the ball object projects its balls where they were seen; check the ids")
     N = J.T @ J
@@ -133,7 +139,7 @@ def _gauss_newton(
             break
         N = A.T @ A
         N[np.diag_indices(6)] *= 1 + damping
-        step = np.linalg.solve(N, A.T @ z)
+        step: Array = np.linalg.solve(N, A.T @ z)
         R_new, t_new = exp_rotation(step[:3]) @ R, t + step[3:]
         r_new, A_new = _weighted(P, R_new, t_new, x_D, balls, W)
         z_new = (W @ r_new[:, :, None]).ravel()
