@@ -70,7 +70,7 @@ def _signs(signs: tuple[int, int, int]) -> Change:
     return lambda p: rotated(p, _with(p, np.array(signs, dtype=np.float64)))
 
 
-def _with(p: Problem, factor: object) -> Array:
+def _with(p: Problem, factor: float | Array) -> Array:
     kind, axes, xyz = _by_axis(p)
     return _as_declared(kind, axes, factor * xyz)
 
