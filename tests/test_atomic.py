@@ -121,6 +121,11 @@ def test_places_that_cannot_be_written_are_named(tmp_path):
         require_absent(tmp_path / "link", force=True)
     with pytest.raises(FileError, match="file or a link to nothing"):
         write(tmp_path / "link", "x", "a")
+    with pytest.raises(FileError, match="link is a link to nothing"):
+        write(tmp_path / "link" / "below" / "it", "x", "a")
+    with pytest.raises(FileError, match="link is a link to nothing"), atomic_file(tmp_path / "link" / "x"):
+        pass
+    assert not (tmp_path / "gone").exists()
     with pytest.raises(FileError, match="a folder is needed"):
         write(tmp_path / "file", "x", "a")
     with pytest.raises(FileError, match="File name too long"):

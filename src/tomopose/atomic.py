@@ -39,16 +39,21 @@ def require_absent(path: str | Path, *, force: bool = False) -> Path:
         raise FileError(f"{str(path)[:200]} is no path that can be written: {error}", path=path) from error
     if there and path.is_symlink() and not path.exists():
         raise FileError(f"{path} is a link to nothing; remove it or give another name", path=path)
-    _require_file_or_folder(path)
+    _require_place(path)
     if there and not force:
         raise FileError(f"{path} exists already; give another name, or force=True to overwrite it", path=path)
     return path
 
 
-def _require_file_or_folder(path: Path) -> None:
-    """FileError for a device, pipe or socket: a file renamed to its name would take it away from every program."""
+def _require_place(path: Path) -> None:
+    """FileError for a device, pipe or socket, which a file renamed to its name would take away from every program, and
+    for a folder on the way that is a link to nothing.
+    """
     if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
         raise FileError(f"{path} is a device, a pipe or a socket; give the name of a file", path=path)
+    for folder in path.parents:
+        if os.path.islink(folder) and not os.path.exists(folder):
+            raise FileError(f"{str(path)[:300]}: the folder {folder} is a link to nothing; remove it", path=path)
 
 
 @contextlib.contextmanager
@@ -62,7 +67,7 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     temporary: Path | None = None
     try:
-        _require_file_or_folder(path)
+        _require_place(path)
         if path.is_symlink():
             path = path.resolve()
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -178,6 +183,7 @@ def only_writer(folder: Path) -> Iterator[None]:
     except ImportError:  # not a POSIX system
         yield
         return
+    _require_place(folder)
     folder = folder.resolve()
     lock = _beside(folder) / f".{folder.name[:100]}.writing"
     while True:
