@@ -7,6 +7,8 @@ import random
 import re
 from collections.abc import Callable
 
+LARGEST = 20_000_000
+"""Bytes that a line repeated over and over may come to."""
 NUMBERS = (
     b"0",
     b"-1",
@@ -108,7 +110,7 @@ def line(data: bytearray, rng: random.Random) -> None:
     elif what == 1:
         lines.insert(k, lines[rng.randrange(len(lines))])
     elif what == 2:
-        lines[k] = lines[k] * rng.choice((2, 100, 3000))
+        lines[k] = lines[k] * min(rng.choice((2, 100, 3000)), 1 + LARGEST // (1 + len(lines[k])))
     else:
         rng.shuffle(lines)
     data[:] = b"\n".join(lines)

@@ -34,7 +34,8 @@ from mutants import mutant
 from tomopose.errors import TomoposeError
 
 BATCH = 100
-HANG_SECONDS = 60.0
+HANG_SECONDS, STILL_SECONDS = 60.0, 900.0
+"""A mutant hangs after so many processor seconds, or so many by the clock: other work may hold the processors."""
 GROWTH = 2**30
 
 
@@ -78,6 +79,14 @@ def batch(seed: Seed, numbers: range, name: str, folder: Path, send: int) -> Non
         os.write(send, json.dumps((k, *one(seed, content, folder))).encode() + b"\n")
 
 
+def processor_seconds(process: int) -> float:
+    """What a process has used so far; 0 where the system does not say."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        fields = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return 0.0
+
+
 def run_batch(seed: Seed, numbers: range, name: str, folder: Path) -> dict[int, tuple[str, str]]:
     """What became of each mutant of a batch; one that hangs or crashes ends it."""
     receive, send = os.pipe()
@@ -89,12 +98,16 @@ def run_batch(seed: Seed, numbers: range, name: str, folder: Path) -> dict[int, 
     os.close(send)
     found: dict[int, tuple[str, str]] = {}
     left = b""
+    since, used = time.monotonic(), 0.0
     while True:
-        ready, _, _ = select.select([receive], [], [], HANG_SECONDS)
+        ready, _, _ = select.select([receive], [], [], 5.0)
         if not ready:
+            if processor_seconds(child) - used < HANG_SECONDS and time.monotonic() - since < STILL_SECONDS:
+                continue
             os.kill(child, signal.SIGKILL)
             found[max((k for k, (what, _) in found.items() if what == "begun"), default=numbers[0])] = ("hang", "")
             break
+        since, used = time.monotonic(), processor_seconds(child)
         piece = os.read(receive, 1 << 16)
         if not piece:
             break

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tomopose import RigidTransform
+from tomopose.calibration.model.ball_projection import _project_all, project_pose, projection_blocks
 from tomopose.calibration.model.parameters import free_parameters
 from tomopose.calibration.model.problem import pair
 from tomopose.calibration.projection_matrices import projection_matrices
@@ -174,3 +175,17 @@ def test_another_pivot_or_scanner_is_refused(scanner, T_HT, rng):
         projection_matrices(cal, replace(poses, pivot=[0.0, 0.0, 0.0]))
     with pytest.raises(InputError, match="d_SR"):
         projection_matrices(cal, poses, scanner=replace(scanner, d_SR=scanner.d_SR + 0.1))
+
+
+def test_kernels_are_compiled_once_whatever_arrays_are_given(scanner, T_HT, rng):
+    poses = mixed_poses(rng)
+    t = np.array([6.0, -4.0, 11.0])
+    blocks = projection_blocks(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=t, alpha=poses.alpha)
+    each = np.asfortranarray(np.tile(t, (len(poses), 1)))
+    each.setflags(write=False)
+    again = projection_blocks(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=each, alpha=poses.alpha, run=[0] * len(poses))
+    assert np.array_equal(blocks.J_scanner, again.J_scanner)
+    x_D = project_ball(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=t, alpha=poses.alpha)
+    assert np.allclose(blocks.x_D, x_D, rtol=0, atol=1e-9)
+    calibrate(scanner, poses, BallObservations.from_sigma(x_D, 0.01, pose_id=poses.pose_id))
+    assert len(project_pose.signatures) == len(_project_all.signatures) == 1

@@ -48,6 +48,9 @@ SCANNER_COLUMNS = (
 `translation_scale` (nominal 1) multiplies the translations t_MH that the manipulator reports.
 """
 
+YES, NO = np.bool_(True), np.bool_(False)
+"""numba compiles a function once more for a plain True or False that it is called with, not for these."""
+
 
 def scanner_vector(scanner: Scanner, translation_scale: float = 1.0) -> Array:
     """The numbers of SCANNER_COLUMNS, shape (13,)."""
@@ -216,7 +219,6 @@ def _project_all(
     t_k: Array,
     t: Array,
     alpha: Array,
-    derivatives: bool,
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     n = R_k.shape[0]
     x, x_H, y_T = np.full((n, 2), np.nan), np.empty((n, 3)), np.empty((n, 3))
@@ -224,7 +226,7 @@ def _project_all(
     R, M = np.empty((3, 3)), np.empty((3, 3))
     for k in range(n):
         out = Projected(x[k], x_H[k], y_T[k], G_H[k], G_T[k], J_s[k], R, M)
-        project_pose(s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[k], alpha[k], derivatives, out)
+        project_pose(s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[k], alpha[k], YES, out)
     return x, x_H, y_T, G_H, G_T, J_s
 
 
@@ -287,11 +289,11 @@ def projection_blocks(
     scanners = [scanner] if isinstance(scanner, Scanner) else list(scanner)
     s = np.array([scanner_vector(one, translation_scale) for one in scanners])
     n = len(T_MH)
+    given = (T_HT.R, T_HT.t, T_MH.R, T_MH.t, np.broadcast_to(t, (n, 3)), np.broadcast_to(alpha, (n,)))
     # Copies: contiguous and writable, whatever was given, so that the kernel is compiled for one kind of array.
-    t_k, angle = np.array(np.broadcast_to(t, (n, 3)), np.float64), np.array(np.broadcast_to(alpha, (n,)), np.float64)
+    R_HT, t_HT, R_MH, t_MH, t_k, angle = (np.array(x, dtype=np.float64, order="C") for x in given)
     index = np.zeros(n, dtype=np.int64) if run is None else np.array(run, dtype=np.int64)
-    R_MH, t_MH, R_HT, t_HT = (np.array(x, order="C") for x in (T_MH.R, T_MH.t, T_HT.R, T_HT.t))
-    x, x_H, y_T, G_H, G_T, J_s = _project_all(s, index, R_HT, t_HT, R_MH, t_MH, t_k, angle, True)
+    x, x_H, y_T, G_H, G_T, J_s = _project_all(s, index, R_HT, t_HT, R_MH, t_MH, t_k, angle)
     return ProjectionBlocks(
         x_D=x, J_w_HT=-G_T @ skew(y_T), J_t_HT=G_T, J_t=G_H @ R_MH, J_scanner=J_s, x_H=x_H, t=t_k, R_MH=R_MH, G_H=G_H
     )

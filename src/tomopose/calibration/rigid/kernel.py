@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from tomopose.calibration.model.ball_projection import Projected, project_pose
+from tomopose.calibration.model.ball_projection import NO, YES, Projected, project_pose
 from tomopose.units import Array
 
 CONVERGED, STALLED, OUT_OF_ITERATIONS, SINGULAR = 0, 1, 2, 3
@@ -125,7 +125,7 @@ def centres(rows: Rows, freed: Freed, at: Point) -> Array:
     s = freed.s_0.copy()
     _scanner_vectors(freed, at.delta, s)
     for k in range(n):
-        if project_pose(s[run[k]], R_HT, t_HT, R[k], t[k], balls[ball[k]], alpha[k], False, work):
+        if project_pose(s[run[k]], R_HT, t_HT, R[k], t[k], balls[ball[k]], alpha[k], NO, work):
             x[k, 0], x[k, 1] = found[0], found[1]
     return x
 
@@ -163,7 +163,7 @@ def normal_equations(rows: Rows, s: Array, freed: Freed, at: Point, N: Array, g:
     for k in range(n):
         if weight[k] == 0.0:
             continue
-        if not project_pose(s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[ball[k]], alpha[k], True, work):
+        if not project_pose(s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[ball[k]], alpha[k], YES, work):
             return np.inf
         du, dv = x_meas[k, 0] - x[0], x_meas[k, 1] - x[1]
         r0 = W[k, 0, 0] * du + W[k, 0, 1] * dv
