@@ -188,4 +188,5 @@ def test_kernels_are_compiled_once_whatever_arrays_are_given(scanner, T_HT, rng)
     x_D = project_ball(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=t, alpha=poses.alpha)
     assert np.allclose(blocks.x_D, x_D, rtol=0, atol=1e-9)
     calibrate(scanner, poses, BallObservations.from_sigma(x_D, 0.01, pose_id=poses.pose_id))
-    assert len(project_pose.signatures) == len(_project_all.signatures) == 1
+    assert len(_project_all.signatures) == 1
+    assert len(project_pose.signatures) <= 1  # none where all that calls it came from the cache

@@ -6,8 +6,8 @@ import numpy as np
 
 from tomopose.units import Array
 
-ROWS = 256
-"""Points compared with all others at a time; memory grows with the number of points, not with its square."""
+PAIRS = 200_000
+"""Pairs compared at a time: a few MB, however many points there are."""
 
 
 def largest_distance(points: Array) -> float:
@@ -21,7 +21,8 @@ def largest_distance(points: Array) -> float:
     radius = np.linalg.norm(x - x.mean(axis=0), axis=1)
     largest = float(np.linalg.norm(x - x[int(np.argmax(radius))], axis=1).max())
     outer = x[radius + radius.max() >= largest * (1 - 1e-12)]
-    for start in range(0, len(outer), ROWS):
-        away = outer[start : start + ROWS, None] - outer[None, start:]
+    rows = max(1, PAIRS // len(outer))
+    for start in range(0, len(outer), rows):
+        away = outer[start : start + rows, None] - outer[None, start:]
         largest = max(largest, float(np.sqrt(np.einsum("ijk,ijk->ij", away, away).max())))
     return largest

@@ -1,0 +1,44 @@
+"""Memory of a calibration: in proportion to its centres, whatever the number of poses and balls."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from tomopose.calibration.solve import calibrate
+from tomopose.geometry.projection import project_ball
+from tomopose.manipulator.poses import PoseSequence
+from tomopose.observations import BallObservations
+
+BALLS = 8
+
+
+def peak_of_a_calibration(scanner, T_HT, poses: int) -> int:
+    """Largest memory, bytes, that is held while so many poses, with all balls in each, are calibrated."""
+    rng = np.random.default_rng(poses)
+    x, angles, alpha = (
+        np.repeat(a, BALLS, axis=0)
+        for a in (rng.uniform(-9, 9, (poses, 3)), rng.uniform(-6, 6, (poses, 3)), rng.choice([0.0, np.pi / 2], poses))
+    )
+    ball = np.tile(np.arange(BALLS), poses)
+    table = PoseSequence.from_table(x, angles, alpha=alpha, ball_id=ball)
+    t = rng.uniform(-12, 12, (BALLS, 3))[ball]
+    x_D = project_ball(scanner, T_HT=T_HT, T_MH=table.T_MH, t=t, alpha=alpha) + rng.normal(0, 0.01, (len(table), 2))
+    observations = BallObservations.from_sigma(x_D, 0.01, pose_id=table.pose_id)
+    tracemalloc.start()
+    try:
+        calibrate(scanner, table, observations)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.slow
+def test_four_times_the_poses_take_four_times_the_memory(scanner, T_HT):
+    peak_of_a_calibration(scanner, T_HT, 20)  # what is imported and compiled once is not a calibration's
+    few, many = (peak_of_a_calibration(scanner, T_HT, n) for n in (100, 400))
+    assert many < 5 * few
+    # Measured: 11.5 kB a centre, most of it the columns of the tests of the scanner's values.
+    assert many < 13_000 * 400 * BALLS
