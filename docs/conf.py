@@ -13,7 +13,10 @@ author = "The tomopose developers"
 copyright = "The tomopose developers"
 release = version = tomopose.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc"]
+extensions = ["myst_nb", "sphinx.ext.autodoc"]
+nb_execution_mode = "force"  # the notebooks show what this version does
+nb_execution_raise_on_error = True
+nb_execution_timeout = 600
 myst_enable_extensions = ["dollarmath", "deflist", "colon_fence"]
 myst_heading_anchors = 3
 root_doc = "index"
@@ -45,6 +48,7 @@ GROUPS = {
     "reconstruction": ("Reconstruct", ("reconstruction", "engines", "volume")),
     "measurement": ("Measure", ("measurement", "uncertainty")),
     "simulation": ("Simulate", ("simulation",)),
+    "report": ("Look in a notebook", ("report",)),
 }
 """Page of the reference -> its title (a task) and the rooms whose public names it lists; the first that fits counts."""
 

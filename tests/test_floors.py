@@ -18,6 +18,8 @@ ROOMS = {
     "cmcrameri": ("report", "studies", "measurement"),
     "astra": ("engines",),
     "itk": ("engines",),
+    "starlette": ("review",),
+    "uvicorn": ("review",),
     "typer": ("cli",),
     "rich": ("cli",),
     "click": ("cli",),

@@ -177,6 +177,10 @@ from .reconstruction.settings import OSSART as OSSART
 from .reconstruction.settings import SART as SART
 from .reconstruction.settings import EarlierOptions as EarlierOptions
 from .reconstruction.settings import Execution as Execution
+from .report.notebook import plot_detections as plot_detections
+from .report.notebook import plot_observability as plot_observability
+from .report.notebook import plot_residuals as plot_residuals
+from .report.notebook import plot_scan as plot_scan
 from .simulation.detector.detector import Detector as Detector
 from .simulation.detector.scatter_glare_mtf import MTF as MTF
 from .simulation.detector.scatter_glare_mtf import Glare as Glare

@@ -19,6 +19,7 @@ EXPECTED = {
     "planning": "tilted [1. 1.]",
     "reconstruction": "true 0.05 /mm",
     "measurement": "points;",
+    "report": "'Residuals on the detector', 'Correlations'",
     "simulation": "112 radiographs of (183, 211)",
 }
 """What the printed text of each example holds."""

@@ -2,106 +2,87 @@
 
 from __future__ import annotations
 
-import json
-import os
 import re
-import shutil
-import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from tomopose.report import calibration_report, matrices_report, observations_report, write_report
+from browser import open_browser, violations
+from tomopose.report import (
+    Figure,
+    Page,
+    Section,
+    calibration_report,
+    matrices_report,
+    observations_report,
+    render,
+    write_report,
+)
+from tomopose.report.style import axis, layout
 
 pytestmark = pytest.mark.browser
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-HARMLESS = ("GPU stall due to ReadPixels", "Canvas2D: Multiple readback operations")
-"""Remarks about speed that a browser without a graphics card makes."""
-
-OF_THE_BROWSER = "not an origin"
-"""What the browser's log names as the initiator of its own requests (updates, its clock); a page has an origin."""
-
 
 @pytest.fixture(scope="module")
-def chromium() -> str:
-    """A Chromium.  Its absence is a failure where CI is set, a skip elsewhere."""
-    found = next(filter(None, map(shutil.which, (os.environ.get("TOMOPOSE_CHROMIUM", ""), *NAMES))), None)
-    if found is None:
-        message = "the browser tests did not run: no Chromium found (set TOMOPOSE_CHROMIUM, or install chromium)"
-        if os.environ.get("CI"):
-            pytest.fail(message)
-        pytest.skip(message)
-    return found
+def browser():
+    with open_browser() as opened:
+        yield opened
 
 
-def visit(chromium: str, page: Path, folder: Path) -> tuple[str, list[str], list[str]]:
-    """The page's DOM after its scripts ran, its words to the console, and the addresses it asked a network for."""
-    log = folder / "net.json"
-    result = subprocess.run(
-        [
-            chromium,
-            "--headless",
-            "--no-sandbox",
-            "--disable-gpu",
-            "--enable-unsafe-swiftshader",
-            "--disable-background-networking",
-            "--disable-component-update",
-            "--no-first-run",
-            "--disable-sync",
-            "--host-resolver-rules=MAP * ~NOTFOUND",
-            f"--user-data-dir={folder / 'profile'}",
-            f"--log-net-log={log}",
-            "--window-size=1400,6000",
-            "--virtual-time-budget=20000",
-            "--enable-logging=stderr",
-            "--dump-dom",
-            page.as_uri(),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=180,
-        check=True,
-    )
-    console = [
-        line for line in re.findall(r'CONSOLE:\d+\] "(.*?)", source', result.stderr) if not line.startswith(HARMLESS)
-    ]
-    console = [line for line in console if not any(words in line for words in HARMLESS)]
-    events = [event.get("params", {}) for event in json.loads(log.read_text(encoding="utf-8"))["events"]]
-    requests = [p["url"] for p in events if "url" in p and p.get("initiator", OF_THE_BROWSER) != OF_THE_BROWSER]
-    return result.stdout, console, requests
+class Visit:
+    """A page after its scripts ran, what it said to the console, and what it asked a network for."""
+
+    def __init__(self, browser, html: str, folder: Path, *, width: int = 1400, scheme: str = "light") -> None:
+        write_report(folder / "report.html", html)
+        self.console: list[str] = []
+        self.requests: list[str] = []
+        self.page = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme).new_page()
+        self.page.on("console", lambda message: self.console.append(message.text))
+        self.page.on("pageerror", lambda error: self.console.append(str(error)))
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto((folder / "report.html").as_uri())
+
+    @property
+    def drawn(self) -> int:
+        return int(self.page.evaluate("document.body.dataset.figuresDrawn"))
+
+    def draw_all(self) -> None:
+        self.page.evaluate("tomoposeFigures.all()")
+
+    def count(self, selector: str) -> int:
+        return self.page.locator(selector).count()
 
 
-def inspect(chromium: str, html: str, folder: Path, *, flat: int, space: int) -> str:
-    """Visit a report and require so many plots in the plane and so many in space, and silence."""
-    write_report(folder / "report.html", html)
-    dom, console, requests = visit(chromium, folder / "report.html", folder)
-    body = re.sub(r"<script.*?</script>", "", dom, flags=re.S)
-    assert f'data-figures-drawn="{flat + space}"' in body
-    assert len(re.findall(r'<div class="plot js-plotly-plot"', body)) == flat + space
-    assert len(re.findall(r'<div id="scene"|<div class="gl-container"', body)) >= space
-    assert body.count("<canvas") == space
-    assert "WebGL is not supported" not in body
-    plots = re.split(r'<div class="plot js-plotly-plot"', body)[1:]
-    assert all('class="main-svg"' in plot for plot in plots)
-    assert console == []
-    assert requests == []
-    return body
+def inspect(browser, html: str, folder: Path, *, flat: int, space: int) -> Visit:
+    """Visit a report and require so many plots in the plane and so many in space, each with marks, and silence."""
+    visit = Visit(browser, html, folder)
+    visit.draw_all()
+    assert visit.drawn == flat + space
+    assert visit.count(".plot[data-drawn]") == flat + space
+    assert visit.count(".plot canvas.space") == space
+    marks = "e => e.querySelectorAll('.point, .line, .bar, .cell, canvas').length"
+    assert all(visit.page.locator(".plot").nth(k).evaluate(marks) for k in range(flat + space))
+    inked = "e => e.getContext('2d').getImageData(0, 0, e.width, e.height).data.some(x => x > 0)"
+    assert all(visit.page.locator("canvas.space").nth(k).evaluate(inked) for k in range(space))
+    assert visit.console == []
+    assert [r for r in visit.requests if not r.startswith(("file:", "data:"))] == []
+    return visit
 
 
-def test_a_full_report_is_drawn(chromium, sample, scan, tmp_path):
+def test_a_full_report_is_drawn(browser, sample, scan, tmp_path):
     calibration, observations, poses = sample()
     html = calibration_report(calibration, observations=observations, poses=poses, scan=scan)
-    body = inspect(chromium, html, tmp_path, flat=12, space=3)
-    assert body.count('class="point"') > 5 * len(calibration.pose_id)
+    visit = inspect(browser, html, tmp_path, flat=12, space=3)
+    assert visit.count(".point") > 5 * len(calibration.pose_id)
 
 
-def test_a_bare_report_is_drawn(chromium, sample, tmp_path):
+def test_a_bare_report_is_drawn(browser, sample, tmp_path):
     calibration, _, _ = sample(turns=(0.0,))
-    inspect(chromium, calibration_report(calibration, observations=None, poses=None), tmp_path, flat=8, space=1)
+    inspect(browser, calibration_report(calibration, observations=None, poses=None), tmp_path, flat=8, space=1)
 
 
-def test_the_other_reports_are_drawn(chromium, sample, scan, tmp_path):
+def test_the_other_reports_are_drawn(browser, sample, scan, tmp_path):
     _, observations, _ = sample()
     for name, html, flat, space in (
         ("observations", observations_report(observations), 2, 0),
@@ -109,19 +90,85 @@ def test_the_other_reports_are_drawn(chromium, sample, scan, tmp_path):
     ):
         folder = tmp_path / name
         folder.mkdir()
-        inspect(chromium, html, folder, flat=flat, space=space)
+        inspect(browser, html, folder, flat=flat, space=space)
 
 
-def test_a_page_that_tries_to_load_is_noticed_and_stopped(chromium, sample, tmp_path):
-    """The checks above can fail: a smuggled address is refused by the page's policy, and seen where there is no
-    policy."""
+def test_plots_are_drawn_when_they_are_scrolled_to(browser, sample, scan, tmp_path):
+    calibration, observations, poses = sample()
+    html = calibration_report(calibration, observations=observations, poses=poses, scan=scan)
+    visit = Visit(browser, html, tmp_path)
+    visit.page.wait_for_timeout(200)
+    before = visit.drawn
+    assert before < 15
+    visit.page.locator(".plot").last.scroll_into_view_if_needed()
+    visit.page.wait_for_function("document.querySelectorAll('.plot')[14].dataset.drawn === 'yes'")
+    assert visit.drawn > before
+
+
+def test_a_page_that_tries_to_load_is_noticed_and_stopped(browser, sample, tmp_path):
+    """The checks above can fail: a smuggled address is refused by the page's policy, and seen where there is none."""
     _, observations, _ = sample()
     html = observations_report(observations).replace("</main>", '<img src="http://192.0.2.1/x.png"></main>')
-    for name, page in (("guarded", html), ("open", re.sub(r"<meta http-equiv=.*?>", "", html))):
-        (tmp_path / name).mkdir()
-        write_report(tmp_path / name / "report.html", page)
-    _, console, requests = visit(chromium, tmp_path / "guarded" / "report.html", tmp_path / "guarded")
-    assert any("Content Security Policy" in line for line in console)
-    assert requests == []
-    _, _, requests = visit(chromium, tmp_path / "open" / "report.html", tmp_path / "open")
-    assert requests == ["http://192.0.2.1/x.png"]
+    guarded = Visit(browser, html, tmp_path)
+    assert any("Content Security Policy" in line for line in guarded.console)
+    opened = Visit(browser, re.sub(r"<meta http-equiv=.*?>", "", html), tmp_path)
+    assert "http://192.0.2.1/x.png" in opened.requests
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_report_is_accessible(browser, sample, scan, tmp_path, scheme):
+    calibration, observations, poses = sample(verdict="doubtful")
+    html = calibration_report(calibration, observations=observations, poses=poses, scan=scan)
+    visit = Visit(browser, html, tmp_path, scheme=scheme)
+    visit.draw_all()
+    assert violations(visit.page) == []
+
+
+@pytest.mark.parametrize("width", [360, 700, 1400])
+def test_nothing_is_wider_than_the_window(browser, sample, scan, tmp_path, width):
+    calibration, observations, poses = sample()
+    html = calibration_report(calibration, observations=observations, poses=poses, scan=scan)
+    visit = Visit(browser, html, tmp_path, width=width)
+    visit.draw_all()
+    assert visit.page.evaluate("document.documentElement.scrollWidth") <= width
+    wide = "e => e.scrollWidth > e.clientWidth + 1 && getComputedStyle(e).overflowX === 'visible'"
+    if width < 640:
+        tables = visit.page.locator("table")
+        assert not any(tables.nth(k).evaluate(wide) for k in range(tables.count()))
+
+
+def test_a_table_is_sorted_by_the_keyboard(browser, sample, tmp_path):
+    _, observations, _ = sample()
+    visit = Visit(browser, observations_report(observations), tmp_path)
+    visit.page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+    table = visit.page.locator("table").last
+    button = table.locator("thead button").nth(1)
+    button.focus()
+    cells = "t => [...t.tBodies[0].rows].map(r => parseFloat(r.children[1].textContent)).filter(x => !isNaN(x))"
+    for order, sign in (("ascending", 1), ("descending", -1)):
+        visit.page.keyboard.press("Enter")
+        assert table.locator("th").nth(1).get_attribute("aria-sort") == order
+        values = np.array(table.evaluate(cells))
+        assert len(values) > 100
+        assert (sign * np.diff(values) >= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "labels", "note"),
+    [
+        (0.0, 1.0, ["0.0", "0.2", "0.4", "0.6", "0.8", "1.0"], ""),
+        (-0.0003, 0.0003, ["−200", "0", "200"], " · 10⁻⁶"),
+        (0.0, 25000.0, ["0", "5", "10", "15", "20", "25"], " · 10³"),
+        (1021.4, 1021.46, ["0", "20", "40", "60"], " − 1021.40, · 10⁻³"),
+    ],
+)
+def test_tick_labels_have_at_most_four_digits(browser, low, high, labels, note, tmp_path):
+    figure = Figure(title="t", meaning="m", look_for="l", data=[], layout=layout(xaxis=axis("x"), yaxis=axis("y")))
+    figure = Figure(**{**vars(figure), "data": [{"type": "scatter", "x": [low, high], "y": [0, 1]}]})
+    html = render(Page(title="ticks", sections=[Section(title="s", blocks=[figure])]))
+    visit = Visit(browser, html, tmp_path)
+    count = 3 if len(labels) == 3 else 5
+    found = visit.page.evaluate(f"tomoposeNumbers.ticks({low}, {high}, {count})")
+    assert found["labels"] == labels
+    assert found["note"] == note
+    assert all(sum(c.isdigit() for c in label) <= 4 for label in found["labels"])

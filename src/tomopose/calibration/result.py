@@ -23,7 +23,8 @@ from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.error_models import Errors, RigidErrors
 from tomopose.provenance import Provenance
-from tomopose.units import Array, float_array
+from tomopose.units import Array, float_array, value_with_uncertainty
+from tomopose.values import verdict_html
 
 Arrangement: TypeAlias = Literal["moving-object", "moving-scanner", "twin", "turntable"]
 ARRANGEMENTS: tuple[Arrangement, ...] = get_args(Arrangement)
@@ -186,6 +187,15 @@ class Calibration:
             object.__setattr__(self, name, float_array(getattr(self, name)))
         if self.pivot is not None:
             object.__setattr__(self, "pivot", float_array(self.pivot))
+
+    def _repr_html_(self) -> str:
+        """The verdict with its reasons, and the parameters with U, for notebooks."""
+        fit = f"d_rms {self.d_rms:.3g} px, {self.d_rms_um:.3g} um at the ball" if self.pose_id else "no residuals"
+        lines = [*self.reasons, f"{self.status or 'no status'}; {fit}; {len(self.outliers)} centres set aside"]
+        rows = [
+            [p.name, value_with_uncertainty(p.value, p.u, p.unit), f"{2 * p.u:.2g} {p.unit}"] for p in self.parameters
+        ]
+        return verdict_html(self.verdict, lines, ["parameter", "value", "U (k = 2)"], rows)
 
     @property
     def verdict(self) -> Verdict:

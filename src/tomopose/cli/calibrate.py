@@ -14,7 +14,11 @@ from tomopose.cli.common import arguments, either, names
 from tomopose.cli.options import add_command
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
     from tomopose import BallObservations, Calibration, PoseSequence, Scanner, TwinRobots
+    from tomopose.calibration.records.decisions import Decision
     from tomopose.manipulator.twin_file import TwinDrawing
 
 EPILOG = (
@@ -27,7 +31,9 @@ EPILOG = (
     "A table that turns alone: tomopose calibrate --arrangement turntable --scanner scanner.json --poses poses.csv "
     "--observations observations.csv --out cal/\n\n"
     "Multi-sphere: tomopose calibrate --method multi-sphere --standard standard.csv --scanner scanner.json --poses "
-    "scan.csv --images standard_radiographs/ --out path/"
+    "scan.csv --images standard_radiographs/ --out path/\n\n"
+    "Reviewed: tomopose calibrate --scanner scanner.json --poses poses.csv --images radiographs/ --ball-diameter-mm 8 "
+    "--review cal/review.jsonl --out reviewed/"
 )
 ARRANGEMENTS = ("moving-object", "moving-scanner", "turntable")
 METHODS = ("poses", "turntable", "multi-sphere")
@@ -180,31 +186,24 @@ def solve(o: Options, given: Inputs) -> Calibration:
         return error.calibration
 
 
-def calibrate(options: Options) -> int:
-    """Find how the manipulator sits in the scanner.  No start value is needed.
+def after_review(given: Inputs, decisions: Sequence[Decision]) -> Inputs:
+    """The inputs with the observations that the decisions leave."""
+    from tomopose.calibration.records.decisions import decided
 
-    Exit code 3 says that the calibration finished but is not trustworthy; the report leads with the reasons.
+    return replace(given, observations=decided(given.observations, decisions))
+
+
+def made_by(
+    o: Options, given: Inputs, result: Calibration, decisions: Sequence[Decision], facts: Mapping[str, str]
+) -> Calibration:
+    """The result with its provenance, whose time is that of the last decision: a replay gives the same bytes.
+
+    facts: what the project file says for reports.
     """
-    import tomopose as tp
-    from tomopose.cli.job import calibration_summary, exit_code, require_free_folder, write_calibration_folder
-    from tomopose.manipulator.error_models import RigidErrors
     from tomopose.provenance import provenance
 
-    o = options
-    if o.method == "multi-sphere":
-        return calibrate_multi_sphere(o)
-    if o.standard is not None:
-        raise typer.BadParameter("belongs to --method multi-sphere", param_hint="--standard")
-    either(o.images, o.observations)
-    require_arrangement(o)
-    require_free_folder(o.out, force=o.force)
-    scale_bars(o.distance)
-    given = read_inputs(o)
-    result = solve(o, given)
-    # Where the scanner moves, the chain runs through the inverse poses.
-    shown = tp.inverse_poses(given.poses) if o.moving_scanner or given.twin is not None else given.poses
     made = provenance(
-        inputs=[p for p in (o.scanner, o.poses, o.observations, o.manipulator, o.twin, o.source_poses) if p],
+        inputs=[p for p in (o.scanner, o.poses, o.observations, o.manipulator, o.twin, o.source_poses, o.review) if p],
         arguments=arguments(
             model=o.model,
             free=o.free,
@@ -216,11 +215,62 @@ def calibrate(options: Options) -> int:
             d_sd_sigma_mm=o.distance_sigma or None,
             from_pose=o.from_pose,
             until_pose=o.until_pose,
-        ),
+        )
+        | ({"measurement": dict(facts)} if facts else {}),
     )
-    result = replace(result, provenance=made)
-    write_calibration_folder(o.out, result, given.observations, shown, images=given.images, force=o.force)
+    return replace(result, provenance=replace(made, time_utc=decisions[-1].when) if decisions else made)
+
+
+def shown_poses(o: CalibrationOptions, given: Inputs) -> PoseSequence:
+    """The pose table as the report draws it: where the scanner moves, the chain runs through the inverse poses."""
+    import tomopose as tp
+
+    return tp.inverse_poses(given.poses) if o.moving_scanner or given.twin is not None else given.poses
+
+
+def write_result(o: Options, out: Path, result: Calibration, given: Inputs, decisions: Sequence[Decision]) -> None:
+    """The folder of a calibration: values, observations, report, and the job that made them."""
+    from tomopose.cli.calibration_job import job_of
+    from tomopose.cli.job import write_calibration_folder
+
+    write_calibration_folder(
+        out,
+        result,
+        given.observations,
+        shown_poses(o, given),
+        images=given.images,
+        decisions=decisions,
+        job=job_of(o, out),
+        force=o.force,
+    )
+
+
+def calibrate(options: Options) -> int:
+    """Find how the manipulator sits in the scanner.  No start value is needed.
+
+    Exit code 3 says that the calibration finished but is not trustworthy; the report leads with the reasons.
+    """
+    from tomopose.calibration.records.decisions import read_decisions
+    from tomopose.cli.job import calibration_summary, exit_code, require_free_folder
+    from tomopose.cli.project import current_facts
+    from tomopose.manipulator.error_models import RigidErrors
+
+    o = options
+    if o.method == "multi-sphere":
+        return calibrate_multi_sphere(o)
+    if o.standard is not None:
+        raise typer.BadParameter("belongs to --method multi-sphere", param_hint="--standard")
+    either(o.images, o.observations)
+    require_arrangement(o)
+    require_free_folder(o.out, force=o.force)
+    scale_bars(o.distance)
+    decisions = () if o.review is None else read_decisions(o.review)
+    given = after_review(read_inputs(o), decisions)
+    result = made_by(o, given, solve(o, given), decisions, current_facts())
+    write_result(o, o.out, result, given, decisions)
     summary, lines = calibration_summary(result)
+    if decisions:
+        lines.append(f"  {len(decisions)} decisions of a review replayed")
     if not isinstance(result.errors, RigidErrors):
         lines += [f"  {note}" for note in result.observability.notes]
     o.say.result({"out": o.out.name, **summary}, [*lines, f"{o.out}: calibration.json, observations.csv, report.html"])

@@ -114,9 +114,13 @@ class Options(CalibrationOptions, WritingOptions):
         typer.Option(
             "--out",
             help="Folder for calibration.json (multi-sphere: multi-sphere.json and matrices.npz), observations.csv, "
-            "report.html.",
+            "report.html, job.json.",
         ),
     ]
+    review: Annotated[
+        Path | None,
+        typer.Option("--review", help="review.jsonl of `tomopose review`: replay its decisions to the same bytes."),
+    ] = None
     standard: Annotated[
         Path | None,
         typer.Option(

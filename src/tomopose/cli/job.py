@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ RAW = re.compile(r"(?P<n_v>\d+)x(?P<n_u>\d+):(?P<dtype>[^:]+)(:(?P<header>\d+))?
 
 if TYPE_CHECKING:
     from tomopose import BallObservations, Calibration, PoseSequence, ProjectionMatrices, Scanner
+    from tomopose.calibration.records.decisions import Decision
     from tomopose.io.images.sequence import ImageSequence
     from tomopose.manipulator.real_poses import ErrorModel
     from tomopose.report.figures.thumbnails import Thumbnail
@@ -102,7 +103,7 @@ def require_free_folder(out: Path, *, force: bool) -> None:
     """FileError, before any work is done, where the results would overwrite what is there."""
     from tomopose.files import require_absent
 
-    for name in ("calibration.json", "observations.csv", "report.html"):
+    for name in ("calibration.json", "observations.csv", "report.html", "job.json"):
         require_absent(out / name, force=force)
 
 
@@ -146,18 +147,32 @@ def write_calibration_folder(
     *,
     images: ImageSequence | None = None,
     scan: ProjectionMatrices | None = None,
+    decisions: Sequence[Decision] = (),
+    job: Mapping[str, object] | None = None,
     force: bool = False,
 ) -> None:
-    """calibration.json, observations.csv and report.html, all or none."""
+    """calibration.json, observations.csv and report.html, all or none; job.json and decisions.jsonl, where given."""
     import tomopose as tp
-    from tomopose.files import atomic_folder
+    from tomopose.calibration.records.decisions import write_decisions
+    from tomopose.files import atomic_folder, write_json
     from tomopose.report import calibration_report, write_report
 
     pictures = () if images is None else worst(calibration, observations, images)
     with atomic_folder(out, force=force) as folder:
         tp.write_calibration(folder / "calibration.json", calibration)
         tp.write_observations(folder / "observations.csv", observations)
-        html = calibration_report(calibration, observations=observations, poses=poses, thumbnails=pictures, scan=scan)
+        if job is not None:
+            write_json(folder / "job.json", "job", job)
+        if decisions:
+            write_decisions(folder / "decisions.jsonl", decisions)
+        html = calibration_report(
+            calibration,
+            observations=observations,
+            poses=poses,
+            thumbnails=pictures,
+            scan=scan,
+            decisions=decisions,
+        )
         write_report(folder / "report.html", html)
 
 

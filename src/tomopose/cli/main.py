@@ -54,6 +54,7 @@ VERBS = (
     "compare",
     "monitor",
     "report",
+    "review",
     "study",
     "warmup",
     "doctor",

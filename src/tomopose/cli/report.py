@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tomopose.cli.common import OK, ForceOption, JsonOption, QuietOption, Say
 
-EPILOG = "Example: tomopose report cal/ --poses poses.csv --scan matrices.npz --force"
+if TYPE_CHECKING:
+    from tomopose import Calibration
+
+EPILOG = (
+    "Example: tomopose report cal/ --poses poses.csv --scan matrices.npz --force\n\n"
+    "Paper: tomopose report cal/ --poses poses.csv --pdf cal/report.pdf --certificate certificate/ --force"
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -25,17 +31,29 @@ def report(
     ] = None,
     scan: Annotated[Path | None, typer.Option("--scan", help="matrices.npz of a scan, for its effect.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="The HTML file; default report.html in the folder.")] = None,
+    pdf: Annotated[
+        Path | None, typer.Option("--pdf", help="The same as PDF, printed by an installed Chromium.")
+    ] = None,
+    certificate: Annotated[
+        Path | None,
+        typer.Option(
+            "--certificate",
+            help="Folder for the certificate: certificate.html to sign, certificate.xml (DCC); with --pdf a PDF too.",
+        ),
+    ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> int:
     """Write one HTML file that needs no network: verdict, parameters, residuals, pictures, the scene in 3D."""
     import tomopose as tp
+    from tomopose.calibration.records.decisions import read_decisions
     from tomopose.calibration.records.history import read_history
     from tomopose.cli.job import image_source, open_for, worst
     from tomopose.errors import FileError
     from tomopose.files import require_absent
     from tomopose.report import calibration_report, matrices_report, observations_report, write_report
+    from tomopose.report.printing import write_pdf
 
     say = Say(json=as_json, quiet=quiet)
     target = require_absent(out or folder / "report.html", force=force)
@@ -56,6 +74,7 @@ def report(
             thumbnails=pictures,
             scan=matrices,
             history=() if history is None else read_history(history),
+            decisions=read_decisions(folder / "decisions.jsonl") if (folder / "decisions.jsonl").exists() else (),
         )
     elif observations is not None:
         html = observations_report(observations)
@@ -63,6 +82,34 @@ def report(
         html = matrices_report(tp.read_matrices(folder / "matrices.npz"))
     else:
         raise FileError(f"{folder} holds no calibration.json, observations.csv or matrices.npz", path=folder)
+    written = [target, *(() if pdf is None else (require_absent(pdf, force=force),))]
+    if certificate is not None:
+        if calibration is None:
+            raise FileError(f"{folder} holds no calibration.json, of which a certificate would be", path=folder)
+        written += write_certificate(certificate, calibration, pdf=pdf is not None, force=force)
     write_report(target, html)
-    say.result({"out": target.name}, [f"{target}: written"])
+    if pdf is not None:
+        write_pdf(pdf, html)
+    say.result({"out": target.name, "files": [p.name for p in written]}, [f"{p}: written" for p in written])
     return OK
+
+
+def write_certificate(folder: Path, calibration: Calibration, *, pdf: bool, force: bool) -> list[Path]:
+    """certificate.html, certificate.xml and, where it is asked for, certificate.pdf; the files written."""
+    from tomopose.cli.project import NAME, read_project
+    from tomopose.files import atomic_folder, write_text
+    from tomopose.report.certificate.content import certificate_of
+    from tomopose.report.certificate.dcc import dcc_xml
+    from tomopose.report.certificate.page import certificate_report
+    from tomopose.report.printing import write_pdf
+
+    facts = read_project(Path(NAME)).facts if Path(NAME).is_file() else None
+    content = certificate_of(calibration, facts)
+    html = certificate_report(content)
+    names = ["certificate.html", "certificate.xml", *(["certificate.pdf"] if pdf else [])]
+    with atomic_folder(folder, force=force) as place:
+        write_text(place / "certificate.html", html)
+        write_text(place / "certificate.xml", dcc_xml(content))
+        if pdf:
+            write_pdf(place / "certificate.pdf", html)
+    return [folder / name for name in names]

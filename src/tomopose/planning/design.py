@@ -100,7 +100,7 @@ def pose_information(
     return np.asarray(whiteners(total_covariance(detection, b, scatter)) @ J)
 
 
-def _prior_information(free: FreeParameters) -> Array:
+def prior_information(free: FreeParameters) -> Array:
     N = np.zeros((9 + len(free), 9 + len(free)))
     N[9:, 9:] = np.diag(free.information)
     return N
@@ -120,7 +120,7 @@ def predicted_covariance(
     ball = np.asarray(t, dtype=np.float64)
     L = pose_information(scanner, poses, T_HT=T_HT, t=ball, sigma=sigma, free=free, scatter=scatter)
     N = np.einsum("kia,kib->ab", L, L)
-    return inverse_information(N if free is None else N + _prior_information(free))
+    return inverse_information(N if free is None else N + prior_information(free))
 
 
 def _largest_affordable(limits: PlanLimits) -> int:
@@ -273,7 +273,7 @@ def plan_poses(
         "T_HT": T_HT, "t": ball, "sigma": settings.sigma, "free": freed, "scatter": expected_scatter(settings.maker)
     }  # fmt: skip
     L = pose_information(scanner, pool, **noise)
-    prior = _prior_information(freed)
+    prior = prior_information(freed)
     _require_determined(L, prior, target)
     defaults = {a.name for a in assumed if a.source == "default"}
     exact = np.array([True] * 9 + [name not in defaults for name in freed.names])

@@ -31,7 +31,7 @@ class Chosen:
     value: float
 
 
-def _gains(L: Array, C: Array, M: Array, criterion: Criterion, sign: int) -> Array:
+def criterion_gains(L: Array, C: Array, M: Array, criterion: Criterion, sign: int) -> Array:
     """(k,) change of the criterion by adding (sign +1) or taking away (-1) each candidate.  Lower is better."""
     LC = L @ C
     S = np.eye(2) + sign * (LC @ np.swapaxes(L, 1, 2))
@@ -84,7 +84,7 @@ def exchange(
             index.append(int(i))
             N = N + Ls[i].T @ Ls[i]
         while len(index) < n:
-            i = int(_gains(Ls, np.linalg.inv(N), Ms, criterion, 1).argmin())
+            i = int(criterion_gains(Ls, np.linalg.inv(N), Ms, criterion, 1).argmin())
             index.append(i)
             N = N + Ls[i].T @ Ls[i]
         index, N = _improve(Ls, index, base, N - ridge, Ms, criterion, len(fixed))
@@ -108,7 +108,7 @@ def _improve(
             i = index[place]
             without = N - L[i].T @ L[i]
             C = np.linalg.inv(without + tiny)
-            gains = _gains(L, C, M, criterion, 1)
+            gains = criterion_gains(L, C, M, criterion, 1)
             j = int(gains.argmin())
             if j != i and gains[j] < gains[i] - 1e-9 * abs(gains[i]):
                 index[place] = j

@@ -1,7 +1,8 @@
 """A report as values: sections made of blocks, rendered to one HTML document that needs nothing from a network.
 
-The figures are plain dictionaries in the vocabulary of plotly.js; the script is embedded once, the data are in the
-page as JSON, and a content security policy forbids the browser to load anything from elsewhere.
+The figures are plain dictionaries in the vocabulary of plotly.js, drawn by our own script (`templates/plots`, SVG and
+a canvas for scenes, 50 kB); it is embedded once, the data are in the page as JSON, and a content security policy
+forbids the browser to load anything from elsewhere.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +23,9 @@ Tone = Literal["good", "care", "bad"]
 GOOD: Tone = "good"
 CARE: Tone = "care"
 BAD: Tone = "bad"
+
+
+SOLID = ("scatter3d", "mesh3d")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +43,11 @@ class Figure:
     height: int = 420
     wide: bool = True
     kind: Literal["figure"] = "figure"
+
+    @property
+    def solid(self) -> bool:
+        """Whether it is a scene in space, which the keyboard can turn."""
+        return any(trace["type"] in SOLID for trace in self.data)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,24 +119,40 @@ class KeyFigure:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Answer:
+    """A question that a reader comes with, answered in a sentence or two."""
+
+    question: str
+    words: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class Page:
     """A whole report."""
 
     title: str
     subtitle: str = ""
     verdict: Verdict | None = None
+    answers: Sequence[Answer] = ()
     key_figures: Sequence[KeyFigure] = ()
     sections: Sequence[Section] = field(default_factory=tuple)
     footer: str = ""
 
 
-@lru_cache(maxsize=1)
-def plotly_script() -> str:
-    """plotly.js as shipped with the plotly package."""
-    from plotly.offline import get_plotlyjs
+PLOT_SCRIPTS = ("numbers.js", "plane.js", "space.js", "plots.js")
+"""Parts of the plotting script, in the order in which they use one another."""
 
-    # A closing tag inside the script would end it early, and a byte order mark or a map reference is of no use here.
-    return str(get_plotlyjs()).replace("</script", "<\\/script")
+
+@lru_cache(maxsize=1)
+def plots_script() -> str:
+    """The script that draws figures, for a script element or a file of its own."""
+    folder = files("tomopose.report") / "templates" / "plots"
+    return "\n".join((folder / name).read_text(encoding="utf-8") for name in PLOT_SCRIPTS)
+
+
+def figure_content(figure: Figure) -> dict[str, Any]:
+    """What the plotting script takes: traces and layout."""
+    return {"data": figure.data, "layout": figure.layout}
 
 
 def script_json(value: object) -> str:
@@ -152,14 +178,14 @@ def render(page: Page) -> str:
     )
     environment.filters["identity"] = id
     figures = [block for section in page.sections for block in section.blocks if isinstance(block, Figure)]
-    content = {f"figure-{k}": {"data": f.data, "layout": f.layout} for k, f in enumerate(figures)}
+    content = {f"figure-{k}": figure_content(f) for k, f in enumerate(figures)}
     names = {id(f): f"figure-{k}" for k, f in enumerate(figures)}
     return environment.get_template("page.html.j2").render(
         page=page,
         names=names,
         thumbnail_svg=lambda thumbnail: Markup(thumbnail_svg(thumbnail)),
         figures_json=Markup(script_json(content)),
-        plotly=Markup(plotly_script()) if figures else "",
+        plots=Markup(plots_script()) if figures else "",
     )
 
 

@@ -141,6 +141,22 @@ def value(cls: type[T] | None = None, *, kw_only: bool = True) -> type[T] | Call
     return decorate if cls is None else decorate(cls)
 
 
+TONES = {"trustworthy": "#1a6b3d", "doubtful": "#8a5200", "rejected": "#b3261e"}
+"""Colours of the verdicts, readable on white and, as borders, on dark grounds."""
+
+
+def verdict_html(verdict: str, lines: Sequence[str], columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A verdict, what it rests on, and a table, as a notebook shows them; all texts are escaped."""
+    said = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
+    head = "".join(f'<th scope="col">{html.escape(c)}</th>' for c in columns)
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    colour = TONES.get(verdict, "#55606d")
+    return (
+        f'<div style="border-left: 5px solid {colour}; padding-left: 12px"><b>{html.escape(verdict.capitalize())}</b>'
+        f"<ul>{said}</ul></div><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    )
+
+
 class Rows(ABC):
     """n rows with the names `pose_id`: what sequences of poses, observations and matrices have in common.
 

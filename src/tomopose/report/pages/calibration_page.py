@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from tomopose.calibration.records.decisions import Decision
 from tomopose.calibration.result import Calibration
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.manipulator.poses import PoseSequence
@@ -29,6 +30,7 @@ from tomopose.report.page import (
     render,
 )
 from tomopose.report.pages.history_page import history_section
+from tomopose.report.sections.answers import answers, condition_words, fit_words
 from tomopose.report.sections.checks import checks_section, findings_table
 from tomopose.report.sections.observability import observability_section
 from tomopose.report.sections.parameters import parameters_section
@@ -57,6 +59,7 @@ def calibration_report(
     thumbnails: Sequence[Thumbnail] = (),
     scan: ProjectionMatrices | None = None,
     history: Sequence[Mapping[str, object]] = (),
+    decisions: Sequence[Decision] = (),
     title: str = "Calibration report",
 ) -> str:
     """One offline HTML document about a calibration.
@@ -69,6 +72,7 @@ def calibration_report(
     thumbnails:   pictures of the worst detections, worst first (`worst_thumbnails` makes them).
     scan:         matrices of a scan made with this calibration: adds the source's path and the expected effect.
     history:      entries of the machine's history file, oldest first: adds control charts where there are three.
+    decisions:    of a person about the detections, oldest first: all of them are listed.
 
     Returns
     -------
@@ -78,6 +82,7 @@ def calibration_report(
     sections = [
         *findings_table(calibration),
         parameters_section(calibration),
+        *decisions_section(decisions),
         *_data_sections(calibration, observations=observations, poses=poses, thumbnails=thumbnails, scan=scan),
         *(section for section in (checks_section(calibration), history_section(history)) if section is not None),
         provenance_section(calibration.provenance),
@@ -87,12 +92,28 @@ def calibration_report(
         subtitle=f"{n} radiographs used, {left} set aside · model {calibration.model} · magnification "
         f"{calibration.scanner.magnification:.3f} · pose convention {calibration.convention}",
         verdict=_verdict(calibration),
+        answers=answers(calibration),
         key_figures=_key_figures(calibration, scan),
         sections=sections,
         footer="Written by tomopose. Uncertainties are standard uncertainties unless k = 2 is said. Equation and "
         "figure numbers are those of Butzhammer, Müller and Hausotte, Meas. Sci. Technol. 34 (2023) 015403.",
     )
     return render(page)
+
+
+def decisions_section(decisions: Sequence[Decision]) -> list[Section]:
+    """Every decision that a person took about the detections; nothing where there was none."""
+    if not decisions:
+        return []
+    done = {"accept": "accepted", "leave-out": "left out", "measure-again": "measured again"}
+    table = Table(
+        title="Decisions",
+        meaning="The last decision about a pose counts.",
+        columns=["pose", "decision", "who", "when (UTC)", "why"],
+        rows=[[d.pose_id, done[d.action], d.who, d.when, d.why or "–"] for d in decisions],
+    )
+    lead = "What a person decided about the detections (decisions.jsonl); the result above follows from it."
+    return [Section(title="Manual decisions", lead=lead, blocks=[table])]
 
 
 def _data_sections(
@@ -132,22 +153,31 @@ def _verdict(calibration: Calibration) -> Verdict:
 def _key_figures(calibration: Calibration, scan: ProjectionMatrices | None) -> list[KeyFigure]:
     chi2 = calibration.chi2_dof
     d_px, d_um = (calibration.d_rms, calibration.d_rms_um) if calibration.pose_id else (np.nan, np.nan)
+    seen = calibration.observability
     keys = [
-        KeyFigure(name="Reprojection error d_rms", value=with_unit(d_px, "px"), note="eq. (8)"),
-        KeyFigure(name="… at the object", value=with_unit(d_um, "µm"), note="pitch over the magnification at the ball"),
+        KeyFigure(
+            name="Reprojection error d_rms",
+            value=with_unit(d_px, "px"),
+            note="Distance of detected from calculated centres, eq. (8): small is necessary, not sufficient.",
+        ),
+        KeyFigure(
+            name="… at the object",
+            value=with_unit(d_um, "µm"),
+            note="The same at the ball: pitch over the magnification there.",
+        ),
         KeyFigure(
             name="χ² per degree of freedom",
             value=number(chi2) if np.isfinite(chi2) else NOT_DETERMINABLE,
-            note=f"{calibration.dof} degrees; 1 where noise is all",
+            note=fit_words(chi2, calibration.dof),
         ),
         KeyFigure(
             name="Condition number",
-            value=number(calibration.observability.condition),
-            note=f"{len(calibration.observability.unobservable)} directions unobservable",
+            value=number(seen.condition),
+            note=condition_words(seen.condition, len(seen.unobservable)),
         ),
     ]
     if scan is None or scan.points_sigma is None:
-        keys.append(KeyFigure(name="Expected effect on the scan", value=NOT_GIVEN, note="no scan given"))
+        keys.append(KeyFigure(name="Expected effect on the scan", value=NOT_GIVEN, note="No scan was given (--scan)."))
     else:
         sigma = float(np.sqrt(np.nanmean(np.asarray(scan.points_sigma) ** 2)))
         pitch = np.sqrt(scan.p_u * scan.p_v) * 1000.0 / calibration.scanner.magnification
@@ -155,7 +185,7 @@ def _key_figures(calibration: Calibration, scan: ProjectionMatrices | None) -> l
             KeyFigure(
                 name="Expected effect on the scan",
                 value=f"{number(sigma)} px",
-                note=f"{number(sigma * pitch)} µm at the object, rms",
+                note=f"{number(sigma * pitch)} µm at the object, root mean square; well below half a pixel is good.",
             )
         )
     return keys

@@ -1,0 +1,131 @@
+"""A review as the page sees it: numbers ready to be shown, and figures for the plotting script."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tomopose.calibration.result import Calibration
+from tomopose.report.figures import coverage_figures, residual_figures, scene_figures
+from tomopose.report.figures.thumbnails import ellipse_outline
+from tomopose.report.gather import join
+from tomopose.report.page import Figure, figure_content
+from tomopose.report.words import meaning, small_unit
+from tomopose.review.session import Review, predicted_centres
+from tomopose.units import Array, value_with_uncertainty
+
+
+def residual_lengths(review: Review) -> tuple[Array, Array]:
+    """(predicted (n, 2), distance (n,)), px, of every detection, those set aside too; NaN where there is none."""
+    poses = review.poses
+    where = {p: k for k, p in enumerate(poses.pose_id)}
+    rows = [where.get(p, -1) for p in review.detected.pose_id]
+    known = predicted_centres(review.calibration, poses)
+    predicted = np.array([known[k] if k >= 0 else (np.nan, np.nan) for k in rows]).reshape(-1, 2)
+    return predicted, np.linalg.norm(review.observations.x_D - predicted, axis=1)
+
+
+def worst_first(review: Review) -> list[int]:
+    """Rows without a measurement first, then by falling distance from where the calibration expects the ball."""
+    _, d = residual_lengths(review)
+    return [int(k) for k in np.argsort(-np.where(np.isfinite(d), d, np.inf), kind="stable")]
+
+
+def rows_view(review: Review) -> list[dict[str, Any]]:
+    """One mapping a detection."""
+    o, cal = review.observations, review.calibration
+    predicted, d = residual_lengths(review)
+    usual = float(np.median(cal.d)) if len(cal.pose_id) else float("nan")
+    used, last = set(cal.pose_id), {x.pose_id: x for x in review.decisions}
+    sigma = np.linalg.norm(o.sigma, axis=1)
+    out = []
+    for k, pose in enumerate(o.pose_id):
+        decision = last.get(pose)
+        out.append(
+            {
+                "pose": pose,
+                "image": "" if o.image is None else o.image[k],
+                "used": pose in used,
+                "status": cal.outliers.get(pose) or (o.status[k] if o.status is not None else ""),
+                "x": o.x_D[k],
+                "sigma": sigma[k],
+                "predicted": predicted[k],
+                "d": d[k],
+                "times": d[k] / usual if usual > 0 else None,
+                "outline": _outline(review, k),
+                "decision": None if decision is None else decision.action,
+                "words": "" if decision is None else decision.words,
+            }
+        )
+    return out
+
+
+def _outline(review: Review, k: int) -> list[float] | None:
+    """Centre, semi axes and angle of the silhouette; None where none was found."""
+    o = review.observations
+    if o.x_ellipse is None or o.semi_major is None or o.semi_minor is None:
+        return None
+    angle = 0.0 if o.angle is None or not np.isfinite(o.angle[k]) else float(o.angle[k])
+    values = [*map(float, o.x_ellipse[k]), float(o.semi_major[k]), float(o.semi_minor[k]), angle]
+    return values if np.isfinite(ellipse_outline(values[:2], *values[2:])).all() else None
+
+
+def result_view(calibration: Calibration) -> dict[str, Any]:
+    """Verdict, findings and parameters."""
+    return {
+        "verdict": calibration.verdict,
+        "status": calibration.status,
+        "reasons": calibration.reasons,
+        "findings": [
+            {"rule": f.rule, "words": f.words, "fix": f.remedy, "verdict": f.verdict} for f in calibration.checks
+        ],
+        "d_rms": calibration.d_rms if calibration.pose_id else None,
+        "d_rms_um": calibration.d_rms_um if calibration.pose_id else None,
+        "chi2_dof": calibration.chi2_dof,
+        "used": len(calibration.pose_id),
+        "aside": len(calibration.outliers) + len(calibration.not_seen),
+        "parameters": [
+            {
+                "name": p.name,
+                "meaning": meaning(p.name),
+                "value": value_with_uncertainty(p.value, p.u, p.unit),
+                "u": small_unit(p.u, p.unit),
+            }
+            for p in calibration.parameters
+        ],
+    }
+
+
+def state_view(review: Review) -> dict[str, Any]:
+    """What changes with a decision, without the figures."""
+    return {
+        "rows": rows_view(review),
+        "result": result_view(review.calibration),
+        "decisions": [
+            {"pose": d.pose_id, "words": d.words, "when": d.when, "action": d.action} for d in review.decisions
+        ],
+    }
+
+
+def figures_view(review: Review) -> list[dict[str, Any]]:
+    """The residual plots and the scene of the calibration as it is now; empty where nothing was fitted."""
+    cal = review.calibration
+    if not cal.pose_id:
+        return []
+    joined = join(cal, observations=review.observations, poses=review.poses)
+    figures: list[tuple[str, Figure | None]] = [
+        ("By pose", residual_figures.by_pose(joined)),
+        ("On the detector", residual_figures.quiver(cal, joined)),
+        ("By axis", residual_figures.by_coordinate(joined)),
+        ("Over time", residual_figures.over_sequence(joined)),
+        ("Panel", coverage_figures.detector_map(cal, joined, review.observations)),
+        ("Scene", scene_figures.scanner_scene(cal, joined)),
+        ("Ball", scene_figures.ball_scene(cal, joined)),
+    ]
+    return [_tab(name, figure) for name, figure in figures if figure is not None]
+
+
+def _tab(name: str, figure: Figure) -> dict[str, Any]:
+    words = {"tab": name, "title": figure.title, "meaning": figure.meaning, "look_for": figure.look_for}
+    return {**words, "height": figure.height, "solid": figure.solid, **figure_content(figure)}
