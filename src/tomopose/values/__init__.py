@@ -1,6 +1,17 @@
 """Values that one can hold, and the refusal of others by name."""
 
 from tomopose.values.arguments import require, require_types
-from tomopose.values.held import Column, Rows, content_hash, equal, shown, table, value
+from tomopose.values.held import Column, Rows, content_hash, equal, shown, table, value, verdict_html
 
-__all__ = ["Column", "Rows", "content_hash", "equal", "require", "require_types", "shown", "table", "value"]
+__all__ = [
+    "Column",
+    "Rows",
+    "content_hash",
+    "equal",
+    "require",
+    "require_types",
+    "shown",
+    "table",
+    "value",
+    "verdict_html",
+]
