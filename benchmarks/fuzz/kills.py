@@ -33,7 +33,7 @@ from tomopose.io.volume_files import write_volume
 LONGEST = 0.4
 """Latest moment of a kill after both states were written once, s."""
 RESUMED = ("simulate",)
-"""Verbs that write a file at a time and go on where they stopped: a next run must come to the whole result."""
+"""Verbs that write a file at a time and continue where they stopped: a next run must come to the whole result."""
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
 

@@ -1,7 +1,7 @@
 """Balls on a table that turns alone: do the intervals hold?  `python benchmarks/trust/turntable.py [RUNS]`.
 
 The generator is benchmarks/reality/chain.py, which shares no code with the library.  Scanner values are drawn from the
-stated standard deviations (u_0, v_0 and the roll from anywhere near), the balls stand anywhere in the field of view.
+stated standard deviations (u_0, v_0 and the roll from anywhere near), the balls are anywhere in the field of view.
 Printed: the share of 95 % intervals that hold the truth, and how far a circular scan is off, in its stated sigma.
 """
 
@@ -49,7 +49,7 @@ def turntable_run(
     span: float = 2 * np.pi,
 ) -> Run:
     """A table with balls.  off: deviations of scanner values in place of drawn ones;  sense: -1 for a table whose
-    angles are told the other way round;  span: rad, that it turns."""
+    angles are stated the other way round;  span: rad, that it turns."""
     drawn = {n: s * rng.standard_normal() for n, s in {**STATED, **WIDE}.items()}
     drawn = drawn if off is None else {n: off.get(n, 0.0) for n in drawn}
     values = {n: NOMINAL.get(n, 0.0) + d for n, d in drawn.items()}

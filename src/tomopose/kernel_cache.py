@@ -92,7 +92,7 @@ def compile_each_time() -> None:
 
 
 @contextlib.contextmanager
-def told_of_compiling(told: Callable[[bool], None]) -> Iterator[None]:
+def reporting_compiling(told: Callable[[bool], None]) -> Iterator[None]:
     """Calls told(True) when this process begins to compile a kernel and told(False) when it ends; not for kernels that
     are loaded from the cache.
     """

@@ -54,7 +54,7 @@ def test_intervals_hold_the_truth_of_another_generator_and_a_scan_is_as_good_as_
     assert max(ratio) < 3.5
 
 
-def test_a_table_that_stands_beside_its_nominal_place_needs_no_word():
+def test_a_table_beside_its_nominal_place_needs_no_word():
     """W is defined by the real axis: its offset and lean come out as u_0, roll and tilts, and the scan is right."""
     table = Table(offset=np.array([0.0, 0.4, 0.0]), lean=(2e-3, 1e-3))
     run = turntable_run(np.random.default_rng(7), table=table, off={})
@@ -99,7 +99,7 @@ def test_what_this_set_says_nothing_of_is_refused_in_words(run, cal):
     with pytest.raises(InputError, match="the manipulator moves"):
         tp.calibrate_turntable(run.scanner, moved, run.observations)
     still = replace(run.poses, alpha=np.zeros(160))
-    with pytest.raises(InputError, match="stands at 1 angles only"):
+    with pytest.raises(InputError, match="is at 1 angles only"):
         tp.calibrate_turntable(run.scanner, still, run.observations)
     short = turntable_run(np.random.default_rng(3), balls=1, span=0.05)
     with pytest.raises(NotObservableError, match=r"these circles determine .* only to"):

@@ -77,9 +77,9 @@ def test_without_a_folder_to_keep_kernels_in_warmup_says_how_to_name_one(monkeyp
     warmup.note_done(["detect"])  # nowhere, and without an error
 
 
-def test_a_kernel_that_calls_others_is_told_of_once():
+def test_a_kernel_that_calls_others_is_reported_once():
     said = []
-    with kernel_cache.told_of_compiling(said.append):
+    with kernel_cache.reporting_compiling(said.append):
         assert compiled_anew() == 5.0
     assert said == [True, False]
     compiled_anew()
@@ -101,6 +101,6 @@ def test_progress_says_compiling_once_where_lines_are_plain(capsys):
 def test_each_job_runs_and_compiles_nothing_the_second_time(name):
     warmup.run_job(name)
     said = []
-    with kernel_cache.told_of_compiling(said.append):
+    with kernel_cache.reporting_compiling(said.append):
         warmup.run_job(name)
     assert said == []

@@ -73,7 +73,7 @@ def test_what_is_not_read_is_refused(run, tmp_path):
         run_from_ctsimu({**content, "samples": [{"name": "x"}]})
 
 
-def test_a_sample_stands_where_the_toolbox_puts_it(run, tmp_path):
+def test_a_sample_is_where_the_toolbox_puts_it(run, tmp_path):
     """The centre is that of the mesh's box; deviations turn about the stage's and the sample's own axes, in order."""
     ctsimu = pytest.importorskip("ctsimu.scenario")
     content, files = run_to_ctsimu(run)

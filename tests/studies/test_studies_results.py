@@ -131,7 +131,7 @@ def test_the_gain_is_held_against_the_printed_errors_of_one_unit():
     assert px.found == f"{printed[1] / 0.0002:.3g} times"
     assert um.found == f"{np.sqrt(np.mean(printed[[2, 3, 4, 8, 9, 10]] ** 2)) / 1e-4:.3g} times"
     assert urad.found == f"{np.sqrt(np.mean(printed[5:8] ** 2)) / 0.1:.3g} times"
-    # what is small beside our own stand-in alone is no gain
+    # what is small beside our own substitute alone is no gain
     assert not table1.gain_check(table1.rows_of(case, {
         "paper_method": {**side, "errors": dict.fromkeys(table1.NAMES, 1.0)}, "by_edges": worse, "best": worse,
         "chi2_9": chi2,

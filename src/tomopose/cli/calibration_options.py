@@ -1,4 +1,4 @@
-"""The options of `tomopose calibrate`, which `diagnose` shares but for the results."""
+"""The options of `tomopose calibrate`, which `diagnose` shares except for the results."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ def _bar(label: str) -> Iterator[Progress]:
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as RichProgress
 
-    from tomopose.kernel_cache import told_of_compiling
+    from tomopose.kernel_cache import reporting_compiling
 
     columns = (
         TextColumn("{task.description}"),
@@ -132,12 +132,12 @@ def _bar(label: str) -> Iterator[Progress]:
         def compiling(now: bool) -> None:
             bar.update(task, description="compiling" if now else label)
 
-        with told_of_compiling(compiling):
+        with reporting_compiling(compiling):
             yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def _lines(label: str) -> Iterator[Progress]:
-    from tomopose.kernel_cache import told_of_compiling
+    from tomopose.kernel_cache import reporting_compiling
 
     start = time.monotonic()
     said, told = -1, False
@@ -157,7 +157,7 @@ def _lines(label: str) -> Iterator[Progress]:
             left = f", {elapsed * (total - done) / done:.0f} s left" if 0 < done < total else ""
             tell(f"{label}: {done} of {total}{left}")
 
-    with told_of_compiling(compiling):
+    with reporting_compiling(compiling):
         yield update
 
 

@@ -92,7 +92,7 @@ class PartOptions:
         20_000.0
     )
     blur: Annotated[float, typer.Option("--blur-px", help="Standard width of the unsharpness at the panel.")] = 0.5
-    placing: Annotated[bool, typer.Option("--placing", help="Also search how to stand the part on the plate.")] = False
+    placing: Annotated[bool, typer.Option("--placing", help="Also search how to place the part on the plate.")] = False
     seed: Annotated[int, typer.Option("--seed", help="Random seed for the points of the whole surface.")] = 0
 
 
@@ -261,7 +261,7 @@ def _planned(o: Options) -> int:
     )
     placing = None
     if o.placing:
-        o.say.note("searching how to stand the part")
+        o.say.note("searching how to place the part")
         placing = best_placing(setting)
         setting = replace(setting, part=placing.part, features=placing.features)
     plan = plan_part_scan(setting, progress=o.say.note)
@@ -307,6 +307,6 @@ def _write(o: Options, plan: PartScanPlan, attenuation: str, free: Sequence[Free
     lines = [f"{o.out}: {len(plan)} views of {plan.goal.part.name}; attenuation {attenuation}"]
     if placing is not None:
         best = max(placing.tried, key=lambda name: placing.tried[name])
-        lines.append(f"  stand the part {best} ({len(placing.tried)} placings tried); the views hold for that placing")
+        lines.append(f"  place the part {best} ({len(placing.tried)} placings tried); the views hold for that placing")
     helps = [f"  with {f.name}: {100 * f.gain:+.0f} % of J" for f in free[:3]]
     o.say.result({"out": o.out.name, **document}, [*lines, *plan_lines(plan), *helps])

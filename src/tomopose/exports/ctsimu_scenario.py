@@ -178,7 +178,7 @@ def sample_pose(position: Mapping[str, Any], where: str) -> tuple[Array, Array]:
     """(centre (3,), mm, axes (3, 3) with columns r, s, t) of a sample on the stage, in the stage's coordinates u, v, w.
 
     The centre is that of the sample's bounding box along its own axes. Deviations turn or shift it about the stage's
-    axes (u, v, w) or its own (r, s, t) as they then stand; whether a reconstruction knows them does not matter here.
+    axes (u, v, w) or its own (r, s, t) as they then are; whether a reconstruction knows them does not matter here.
     InputError for a sample that is fixed to the world, and for drifts.
     """
     _known(position, ("center", "centre", "vector_r", "vector_t", "deviations"), where)

@@ -110,7 +110,7 @@ def calibrate_turntable(
 
     Returns
     -------
-    A calibration whose T_HT is the identity by definition: the balls stand in T, and matrices hold for scans that turn
+    A calibration whose T_HT is the identity by definition: the balls are in T, and matrices hold for scans that turn
     the table alone.
 
     Raises
@@ -177,7 +177,7 @@ def _require_turning(data: Problem) -> None:
     angles = np.unique(np.round(np.mod(data.alpha, 2 * np.pi), 9))
     if len(angles) < FEWEST_ANGLES:
         raise InputError(
-            f"the table stands at {len(angles)} angles only (alpha_deg); a circle needs at least {FEWEST_ANGLES}"
+            f"the table is at {len(angles)} angles only (alpha_deg); a circle needs at least {FEWEST_ANGLES}"
         )
 
 

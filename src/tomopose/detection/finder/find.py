@@ -93,7 +93,7 @@ def find_ball(
 def find_balls(
     image: Array, expected_radius: float, aspect: float = 1.0, *, most: int, settings: FinderSettings
 ) -> list[Candidate]:
-    """All circles of about the expected radius, px in u, best first; an empty list where there is none.
+    """All circles of about the expected radius, px in u, best first; an empty list without any.
 
     most: how many balls there are; image and aspect as in `find_ball`.
     """

@@ -11,7 +11,8 @@ rays, so that the information on the position of the surface there, and that on 
 
     I_i = sum_j (a g_ij / w^2) (mu / g_ij)^2 / var_ij        A = sum_i I_i J_i J_i^T
 
-This is a Cramer-Rao bound with all else known, hence optimistic; ratios between sets of views are what it is good for.
+This is a Cramer-Rao bound with all else known, therefore optimistic; ratios between sets of views are what it is good
+for.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ class PartSettings:
     """What J means and how it is searched.
 
     mu:                 linear attenuation coefficient of the part, 1/mm.
-    least_transmission: below it a ray tells nothing of a surface.
+    least_transmission: below it a ray holds no information on a surface.
     tangent:            rad; a ray within this angle of the surface's tangent plane shows where the surface is.
     tuy_width:          rad; standard width of the soft condition of Tuy.
     margin:             px that the whole part keeps from the panel's edge.

@@ -53,7 +53,7 @@ class Target:
 
 
 def targets_of(part: Part, plan: MeasurementPlan | None, *, judged: bool = False, seed: int = 0) -> tuple[Target, ...]:
-    """The features of a measurement plan, or the whole surface where there is none.
+    """The features of a measurement plan, or the whole surface without a plan.
 
     judged: points of another pattern than those that views are chosen with.
     """

@@ -122,7 +122,8 @@ def _beta(goal: Goal, s: Array) -> Array:
     """(n, k, q) rad: angle between the ray through each point and each plane."""
     d = goal.x_tuy[None] - s[:, None]
     d /= np.linalg.norm(d, axis=2)[..., None]
-    return np.arcsin(np.clip(np.abs(d.astype(np.float32) @ goal.planes.T.astype(np.float32)), 0, 1))
+    beta: Array = np.arcsin(np.clip(np.abs(d.astype(np.float32) @ goal.planes.T.astype(np.float32)), 0, 1))
+    return beta
 
 
 def _tuy(goal: Goal, s: Array, tau: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What limits a plan: how to stand the part on the plate, and which freedom would help most, each tried coarsely.
+"""What limits a plan: how to place the part on the plate, and which freedom would help most, each tried coarsely.
 
 The coarse search takes twice the steps of the grid and no refinement; its J is compared only with its own.
 """
@@ -26,7 +26,7 @@ from tomopose.units import Array
 
 COARSE = 2.0
 TURNS_DEG = (30.0, 45.0, 60.0, 90.0)
-"""By which the part is stood up about x and y of W."""
+"""By which the part is tilted about x and y of W."""
 CORNER_DEG = (45.0, 35.264)
 """A cube on its corner."""
 MORE_TILT, MORE_LIFT, MORE_MAGNIFICATION = 2.0, 2.0, 1.25
@@ -43,7 +43,7 @@ class Freedom:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Placing:
-    """How the part is best stood: x -> R (x - centre) + centre, mm in W at home.
+    """How the part is best placed: x -> R (x - centre) + centre, mm in W at home.
 
     tried: rotation vector in words -> J of the coarse search.
     """
@@ -142,6 +142,6 @@ def freedoms(setting: Setting) -> tuple[Freedom, ...]:
     for name, R in placings(setting.part).items():
         if name in ("45 deg about x", "45 deg about y", "90 deg about x"):
             part, features = placed(setting.part, setting.features, R)
-            tried[f"the part stood {name}"] = replace(setting, part=part, features=features)
+            tried[f"the part placed {name}"] = replace(setting, part=part, features=features)
     found = [Freedom(name=name, J=J, gain=J / base - 1) for name, J in ((n, coarse_J(s)) for n, s in tried.items())]
     return tuple(sorted(found, key=lambda f: -f.J))

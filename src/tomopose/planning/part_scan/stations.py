@@ -162,6 +162,6 @@ def _what_blocks(machine: Machine, part: Part, q: Array, settings: PartSettings)
     low_mm, high_mm = machine.limits.low[1 + side], machine.limits.high[1 + side]
     return (
         f"no pose within the limits keeps {part.name} in view: it leaves the panel along {axis}, where "
-        f"{AXES[1 + side]} may move from {low_mm:.4g} to {high_mm:.4g} mm; widen the limits, or stand the part "
+        f"{AXES[1 + side]} may move from {low_mm:.4g} to {high_mm:.4g} mm; widen the limits, or place the part "
         "nearer to the middle"
     )

@@ -34,7 +34,7 @@ def duration(machine: Machine, time: MoveTime, q: Array) -> float:
 
 
 def visiting_order(machine: Machine, q: Array) -> np.ndarray:
-    """(n,) rows of q (n, 7) in a short order that begins nearest to where the machine stands: zero, or its limits.
+    """(n,) rows of q (n, 7) in a short order that begins nearest to the machine's present place: zero, or its limits.
 
     Nearest neighbour, then 2-opt, on a path that need not return; never longer than the order given.
     """

@@ -71,7 +71,7 @@ NOTES = (
     "The specimen and the standard have the paper's kinds of feature and size; all their other measures are this "
     "project's own. The specimen is mounted tilted by 42 degrees, the standard upright; neither angle is printed.",
     "Radiographs hold photon noise (signal to noise 200 in an unbinned pixel of the open beam) in 16 bits, averaged "
-    "over 2 x 2 rays a pixel. But for the rows with the real beam, beam hardening, scatter, focal spot and detector "
+    "over 2 x 2 rays a pixel. Except for the rows with the real beam, beam hardening, scatter, focal spot and detector "
     "blur are left out: the attenuation is that at the mean energy of the tube. With the real beam the spectrum is "
     "that of 180 kV behind 0.25 mm of copper, the blur 0.73 px, scatter 1 % of the open beam and a tenth of the "
     "object's forward-scatter potential, and the circular scan's matrices err by u_0 0.05 px, eta 30 urad, tilts 100 "

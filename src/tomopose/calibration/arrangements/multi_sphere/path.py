@@ -113,7 +113,7 @@ def solve_path(
             chi2 += part.chi2
             parts.append(part)
             residuals.append(part.residuals)
-        C = np.linalg.inv(S)
+        C: Array = np.linalg.inv(S)
         if largest < STILL:
             return PathSolution(
                 scanner=scanner,

@@ -35,7 +35,7 @@ class MultiSphereCalibration(Rows):
     home:      M -> W of the standard at home: matrices are of points of W, mm, with the object at home.
     alone:     (n, 6) by which each view's own pose, scanner and coordinates held at their given values, differs from
                the one along the path: rotation vector, rad, and translation of the standard's middle, mm.
-    manipulator_errors: (n, 6) what the pose table says less what was found, or None where it does not tell.
+    manipulator_errors: (n, 6) what the pose table says less what was found, or None where it does not say.
     lost:      view -> why it has no pose;  left_out: view -> balls that were not used, in words.
     repeatability: of the manipulator between this scan and another one on the same path; None: not stated.
     """

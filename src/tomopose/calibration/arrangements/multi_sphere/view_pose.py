@@ -171,7 +171,7 @@ def _weighted(P: Array, R: Array, t: Array, x_D: Array, balls: Array, W: Array) 
 
 
 def refined_pose(scanner: Scanner, x_D: Array, balls: Array, start: RigidTransform) -> RigidTransform | None:
-    """The pose near `start` that is exact for three balls; None where there is none."""
+    """The pose near `start` that is exact for three balls; None without one."""
     W = np.tile(np.eye(2), (len(balls), 1, 1))
     try:
         T, chi2, *_ = _gauss_newton(scanner, x_D, balls, W, start, START_STEPS)

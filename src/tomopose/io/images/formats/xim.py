@@ -70,7 +70,7 @@ def _header(path: Path) -> tuple[int, int, int, int]:
     _, _, columns, rows, _, size, compressed = HEADER.unpack(head)
     if min(columns, rows) < 2 or size not in (1, 2, 4):
         raise FileError(f"{path} claims {columns} x {rows} pixels of {size} bytes", path=path)
-    # At best a difference of one byte and a quarter of a byte of the table stand for a pixel.
+    # At best a difference of one byte and a quarter of a byte of the table belong to a pixel.
     claimed = columns * rows if compressed else columns * rows * size
     if claimed > path.stat().st_size:
         raise FileError(f"{path} is truncated: {columns} x {rows} pixels do not fit into its length", path=path)

@@ -1,6 +1,6 @@
 """Zeiss Xradia .xrm and .txrm: an OLE container of streams, image k (from 1) in ImageData<ceil(k / 100)>/Image<k>.
 
-ImageInfo/DataType is 3 (uint8), 5 (uint16) or 10 (float32); where it is missing, the stream's length tells. Which of
+ImageInfo/DataType is 3 (uint8), 5 (uint16) or 10 (float32); where it is missing, the stream's length decides. Which of
 its rows is the top the file does not say.  Source: the streams as txrm2tiff 2.2 and dxchange read them.
 """
 
