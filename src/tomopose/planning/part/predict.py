@@ -47,7 +47,8 @@ class Predicted:
 
 def ray_width(scanner: Scanner, blur: float, depth: Array) -> Array:
     """mm at the object: pixel and unsharpness (px), scaled to the depth."""
-    return np.hypot(1.0, 2 * blur) * scanner.p_u * depth / scanner.d_SD
+    width: Array = np.hypot(1.0, 2 * blur) * scanner.p_u * depth / scanner.d_SD
+    return width
 
 
 def information(goal: Goal, scanner: Scanner, P: Array, views: Views, target: Target) -> Array:

@@ -72,7 +72,7 @@ def _large(found: Ranked, least_share: float) -> Ranked:
     return replace(found, chosen=tuple(e for e in found.chosen if e.share > least_share))
 
 
-def _declared(white: Whitened, at: Array, delta: Array) -> Whitened:
+def _declared(white: Whitened, at: np.ndarray, delta: Array) -> Whitened:
     """The same rows with the coordinates `at` held at their declared values, and without their priors."""
     others = np.setdiff1d(np.arange(white.A.shape[1]), at)
     rows = np.concatenate([np.ones(2 * white.n, dtype=bool), (white.A[2 * white.n :, others] != 0).any(axis=1)])
