@@ -190,7 +190,7 @@ def sample_pose(position: Mapping[str, Any], where: str) -> tuple[Array, Array]:
         vector, drift = _vector(entry, "uvw", 1, "mm" if name == "center" else "", f"{where}.{name}")
         if drift.any():
             raise InputError(f"{where}.{name} drifts; samples that move on the stage are not read")
-        directions[name] = vector
+        directions.append(vector)
     centre, r, t = directions
     pose = _Pose(centre=centre[None], axes=_right_handed(r, t, where, "vector_r", "vector_t")[None])
     for k, deviation in enumerate(_list(position.get("deviations"), f"{where}.deviations")):

@@ -54,7 +54,8 @@ class Part:
     def winding(self, x: Array) -> Array:
         """(m,) 1 where points (m, 3), mm, lie in the material, 0 outside."""
         far = self.centre + np.array([3.1, 0.37, 0.59]) * self.mesh.size
-        return material_paths(_looking(far, self.centre)[None], self.mesh.points, self.mesh.faces, x)[1][0]
+        paths: Array = material_paths(_looking(far, self.centre)[None], self.mesh.points, self.mesh.faces, x)[1][0]
+        return paths
 
 
 def _looking(source: Array, at: Array) -> Array:

@@ -6,7 +6,7 @@ is the difference of two large ones: the error of a path stays below 1 nm even a
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numba import njit
@@ -15,7 +15,7 @@ FAR = 1.0e12
 """Where a crossing lies that a half-space or an unbounded slab does not have, mm."""
 
 
-SIDE, FACE_1, FACE_3, FACE_5 = np.int64(0), np.int64(1), np.int64(3), np.int64(5)
+SIDE, FACE_1, FACE_3, FACE_5 = (cast(int, np.int64(k)) for k in (0, 1, 3, 5))
 """Numbers of faces.  numba compiles a function anew for each plain number that it is called with, not for these."""
 
 
