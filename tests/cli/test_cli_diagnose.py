@@ -9,6 +9,7 @@ import numpy as np
 
 import tomopose as tp
 from tomopose.cli.main import run
+from tomopose.geometry.projection import project_ball
 
 
 def said(words, capsys):
@@ -27,8 +28,6 @@ def test_data_that_fit_as_declared_are_exit_code_0_and_said_first(files, capsys)
 def test_a_scanner_that_moves_is_an_arrangement_of_diagnose_too(files, capsys):
     still = replace(files.poses, alpha=np.zeros(len(files.poses)))
     x = tp.read_observations(files.folder / "observations.csv")
-    from tomopose.geometry.projection import project_ball
-
     centres = project_ball(files.scanner, T_HT=files.T_HT, T_MH=still.T_MH, t=[6.0, -4.0, 11.0], alpha=still.alpha)
     rows = [still.pose_id.index(i) for i in x.pose_id]
     tp.write_observations(files.folder / "still.csv", replace(x, x_D=centres[rows]))
@@ -66,7 +65,7 @@ def test_a_turning_table_alone_has_its_own_method(tmp_path, capsys):
     x = np.array([[14.0, -3.0, -20.0], [-5.0, 11.0, 2.0], [3.0, -13.0, 18.0]])
     real = replace(scanner, u_0=739.0, eta=4e-3)
     mount = tp.RigidTransform.identity(tp.Frame.H, tp.Frame.T)
-    seen = tp.project_ball(real, T_HT=mount, T_MH=poses.T_MH, t=x[ball], alpha=alpha)
+    seen = project_ball(real, T_HT=mount, T_MH=poses.T_MH, t=x[ball], alpha=alpha)
     observed = tp.BallObservations.from_sigma(seen + rng.normal(0, 0.015, seen.shape), 0.015, pose_id=poses.pose_id)
     tp.write_scanner(tmp_path / "scanner.json", scanner)
     tp.write_poses(tmp_path / "poses.csv", poses)
