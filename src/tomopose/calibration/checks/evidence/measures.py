@@ -191,7 +191,8 @@ def prior_pulls(e: Evidence, limit: float) -> Iterator[Found]:
 
 
 def effects(e: Evidence, limit: float, steps: bool) -> Iterator[Found]:
-    if e.tests is not None:
+    # where the declared reading does not fit even beside what moved, a movement is a symptom of what is wrong
+    if e.tests is not None or (e.diagnosis is not None and not e.diagnosis.declared.fits):
         return
     least = EFFECT_SHARE if e.coloured else 0.0
     moved: list[Effect] = [
