@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tomopose.calibration.model.problem import STILL_MM, STILL_RAD, travel
 from tomopose.calibration.result import Calibration
 from tomopose.calibration.uncertainty.propagation import field_of_view_points
 from tomopose.calibration.uncertainty.trajectory import scatter_variance, shared_variance
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
-from tomopose.geometry.rotations import rotation_angle_between
 from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.error_models import corrected_poses
@@ -20,7 +20,6 @@ from tomopose.units import Array
 from tomopose.values import require_types
 
 SCANNER_TOLERANCE = 1e-9
-STILL_MM, STILL_RAD = 1e-6, 1e-9
 
 
 def _require_same_pivot(calibration: Calibration, poses: PoseSequence) -> None:
@@ -38,8 +37,8 @@ def _require_same_pivot(calibration: Calibration, poses: PoseSequence) -> None:
 def _require_what_was_calibrated(calibration: Calibration, poses: PoseSequence) -> None:
     if calibration.arrangement != "turntable":
         return
-    T = poses.T_MH
-    if rotation_angle_between(T.R[0], T.R).max() > STILL_RAD or np.abs(T.t - T.t[0]).max() > STILL_MM:
+    shifted, turned = travel(poses.T_MH.R, poses.T_MH.t)
+    if turned > STILL_RAD or shifted > STILL_MM:
         raise InputError(
             "the calibration is one of a turning table alone, which says nothing of the manipulator: its mount is "
             "unknown; calibrate with poses that move before a scan that does"

@@ -27,7 +27,7 @@ from tomopose.calibration.model.parameters import (
     free_parameters,
     translation_scale,
 )
-from tomopose.calibration.model.problem import Problem, pair
+from tomopose.calibration.model.problem import STILL_MM, STILL_RAD, Problem, pair, travel
 from tomopose.calibration.model.unseen import Unseen, unseen_of
 from tomopose.calibration.result import Arrangement, Calibration, PoseNoiseFound
 from tomopose.calibration.rigid.contradiction import NOTHING_FITS, Contradicted, as_stated, contradicted
@@ -35,7 +35,6 @@ from tomopose.calibration.rigid.estimate import Solution, solve, with_pose_noise
 from tomopose.calibration.rigid.fit import blocks, linear_fit
 from tomopose.calibration.rigid.observability import observability
 from tomopose.errors import InputError, NotConvergedError, NotObservableError
-from tomopose.geometry.rotations import rotation_angle_between
 from tomopose.geometry.scanner import Scanner
 from tomopose.manipulator.error_models import PoseScatter, RigidErrors
 from tomopose.manipulator.poses import PoseSequence
@@ -165,8 +164,6 @@ def _tests(solution: Solution) -> ScannerTests | None:
         return None
     return scanner_tests(problem, solution.free, solution.fit)
 
-
-STILL_MM, STILL_RAD = 1e-6, 1e-9
 
 FEWEST_TESTED = 10
 """Equations beyond the unknowns that the tests need."""
@@ -311,8 +308,7 @@ def maker_of(manipulator: ErrorModel | str | Path | Mapping[str, object] | None)
 
 def _require_moves(problem: Problem) -> None:
     """NotObservableError where nothing but the table moves."""
-    shifted = np.abs(problem.t_MH - problem.t_MH[0]).max()
-    turned = rotation_angle_between(problem.R_MH[0], problem.R_MH).max()
+    shifted, turned = travel(problem.R_MH, problem.t_MH)
     if shifted < STILL_MM and turned < STILL_RAD and np.ptp(problem.alpha) > 0:
         raise NotObservableError(
             "the manipulator has one pose throughout and only the table turns: such a set says nothing of the mount "

@@ -26,7 +26,8 @@ from tomopose.calibration.checks.conventions import ALTERNATIVES
 from tomopose.calibration.checks.placement import require_on_panel
 from tomopose.calibration.identified.calibrate import known_bars, pose_rows
 from tomopose.calibration.identified.fit import ModelFit, fit_model
-from tomopose.calibration.identified.map_estimate import KinematicProblem, MapEstimate, State, linear_at, solve_map
+from tomopose.calibration.identified.hypothesis import hypothesis_of
+from tomopose.calibration.identified.map_estimate import KinematicProblem, State, solve_map
 from tomopose.calibration.identified.model_selection import judged
 from tomopose.calibration.identified.result import calibration_of
 from tomopose.calibration.identified.scatter import with_posterior_scatter
@@ -44,14 +45,13 @@ from tomopose.calibration.model.parameters import (
     free_parameters,
     unit_of,
 )
-from tomopose.calibration.model.problem import Problem, pair
+from tomopose.calibration.model.problem import STILL_MM, STILL_RAD, Problem, pair, travel
 from tomopose.calibration.model.silhouettes import chain_matrices
 from tomopose.calibration.model.twin_projection import balls_from_rays
 from tomopose.calibration.result import Calibration
 from tomopose.calibration.solve import freed_names
 from tomopose.errors import InputError, NotConvergedError, NotObservableError
 from tomopose.geometry.frames import Frame
-from tomopose.geometry.rotations import rotation_angle_between
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
@@ -66,7 +66,6 @@ WANTED = ("u_0", "v_0", "eta")
 """What such a set determines well: estimated without a prior, unless scanner.json states one."""
 
 FEWEST_ANGLES = 5
-STILL_MM, STILL_RAD = 1e-6, 1e-9
 
 READINGS = (
     "rows flipped",
@@ -101,7 +100,7 @@ def calibrate_turntable(
     ----------
     scanner:      nominal values.  u_0, v_0 and eta need not be known; d_SR is the scale, with its uncertainty.
     poses:        table angles `alpha` that differ, and the plate at one pose throughout; `ball_id` where there are
-                  several balls.  Two balls at different heights are the least that shows the roll.
+                  several balls: at different heights and radii they show most.
     observations: as in `calibrate`.
     free, fix, priors: as in `calibrate`.
     distances:    (ball id, ball id) -> (distance, standard uncertainty), mm: a scale that d_SR need not give.
@@ -139,10 +138,10 @@ def calibrate_turntable(
         mount_known=True,
     )
     fit = _fitted(problem, robust=robust, widen=auto)
-    own = _hypothesis(fit.estimate, "declared", "the data as declared", "", "declared")
+    own = hypothesis_of(fit.estimate, name="declared", words="the data as declared", remedy="", outcome="declared")
     if own.fits:
         _require_determined(fit)
-    chosen = with_posterior_scatter(fit)
+    chosen = _with_exact_mount(with_posterior_scatter(fit))
     diagnosis = _diagnosis(fit, own) if hypotheses else None
     e = chosen.estimate
     found = calibration_of(
@@ -165,10 +164,15 @@ def calibrate_turntable(
     return replace(found, scanner=replace(found.scanner, sigma=scanner.sigma))
 
 
+def _with_exact_mount(fit: ModelFit) -> ModelFit:
+    """The steps of the iteration round the identity by 1e-27."""
+    state = replace(fit.estimate.state, T_HT=RigidTransform.identity(Frame.H, Frame.T))
+    return replace(fit, estimate=replace(fit.estimate, state=state))
+
+
 def _require_turning(data: Problem) -> None:
     """InputError for poses of which this method knows nothing."""
-    turned = float(rotation_angle_between(data.R_MH[0], data.R_MH).max())
-    shifted = float(np.abs(data.t_MH - data.t_MH[0]).max())
+    shifted, turned = travel(data.R_MH, data.t_MH)
     if turned > STILL_RAD or shifted > STILL_MM:
         raise InputError(
             f"the manipulator moves (by {shifted:.3g} mm and {turned:.3g} rad) while the table turns; this method is "
@@ -227,34 +231,19 @@ def _diagnosis(fit: ModelFit, own: Hypothesis) -> Diagnosis:
         except NotConvergedError:
             # a wrong reading may lead anywhere; one that cannot be fitted is not the right one
             continue
-        one = _hypothesis(estimate, alternative.name, alternative.words, alternative.remedy, "worse")
+        one = hypothesis_of(
+            estimate,
+            name=alternative.name,
+            words=alternative.words,
+            remedy=alternative.remedy,
+            outcome="worse",
+        )
         found.append(replace(compared(own, one), symmetry=alternative.name == MIRRORED))
     return Diagnosis(hypotheses=rank(found))
 
 
 def _rows_of(poses: PoseSequence, data: Problem) -> PoseSequence:
     return replace(poses.select(poses.index_of(data.pose_id)), alpha=data.alpha)
-
-
-def _hypothesis(e: MapEstimate, name: str, words: str, remedy: str, outcome: str) -> Hypothesis:
-    # by the sigmas as they were stated: scatter that was raised until it explains everything explains nothing
-    at = linear_at(replace(e.problem, scatter=1.0), e.state)
-    r, x = at.r, e.problem.data.x_D
-    chi2 = float((at.r_white**2).sum() + (at.prior_residuals**2).sum())
-    d_rms = float(np.sqrt((r**2).sum(axis=1).mean()))
-    return Hypothesis(
-        name=name,
-        words=words,
-        remedy=remedy,
-        d_rms=d_rms,
-        chi2=chi2,
-        dof=e.dof,
-        sigmas=float(np.sqrt(chi2 / max(e.dof, 1))),
-        delta=0.0,
-        factor=1.0,
-        outcome=outcome,
-        share=d_rms / float(np.sqrt(((x - x.mean(axis=0)) ** 2).sum(axis=1).mean())),
-    )
 
 
 def diagnose_turntable(

@@ -9,8 +9,9 @@ import numpy as np
 
 from tomopose.calibration.arrangements.twin_robots import trusted_problem
 from tomopose.calibration.checks.alternative import Alternative
-from tomopose.calibration.checks.convention_tests import Diagnosis, Hypothesis, compared, rank
+from tomopose.calibration.checks.convention_tests import Diagnosis, compared, rank
 from tomopose.calibration.checks.conventions import ALTERNATIVES
+from tomopose.calibration.identified.hypothesis import hypothesis_of
 from tomopose.calibration.identified.map_estimate import STEPS, MapEstimate, solve_map
 from tomopose.calibration.model.problem import Problem, pair
 from tomopose.errors import TomoposeError
@@ -50,10 +51,12 @@ def diagnose_twin(
         problem, start, _ = trusted_problem(scanner, own, seen, twin=robots, mount=mount, free=free, fix=fix)
         return solve_map(problem, start, steps=steps)
 
-    declared = _hypothesis(
+    declared = hypothesis_of(
         fitted(poses, observations, twin, steps=STEPS),
-        Alternative(name="declared", words="the data as declared", remedy="", change=lambda p: p),
-        "declared",
+        name="declared",
+        words="the data as declared",
+        remedy="",
+        outcome="declared",
     )
     found = [declared]
     for alternative, of_poses, seen, robots in _readings(scanner, poses, observations, twin):
@@ -63,26 +66,15 @@ def diagnose_twin(
             # a wrong reading may lead anywhere; one that cannot be fitted is not the right one
             continue
         if np.isfinite(other.chi2) and other.dof > 0:
-            found.append(compared(declared, _hypothesis(other, alternative, "worse")))
+            one = hypothesis_of(
+                other,
+                name=alternative.name,
+                words=alternative.words,
+                remedy=alternative.remedy,
+                outcome="worse",
+            )
+            found.append(compared(declared, one))
     return Diagnosis(hypotheses=rank(found))
-
-
-def _hypothesis(e: MapEstimate, reading: Alternative, outcome: str) -> Hypothesis:
-    r, x = e.at.r, e.problem.data.x_D
-    d_rms = float(np.sqrt((r**2).sum(axis=1).mean()))
-    return Hypothesis(
-        name=reading.name,
-        words=reading.words,
-        remedy=reading.remedy,
-        d_rms=d_rms,
-        chi2=e.chi2,
-        dof=e.dof,
-        sigmas=float(np.sqrt(e.chi2 / e.dof)),
-        delta=0.0,
-        factor=1.0,
-        outcome=outcome,
-        share=d_rms / float(np.sqrt(((x - x.mean(axis=0)) ** 2).sum(axis=1).mean())),
-    )
 
 
 def _readings(

@@ -26,6 +26,15 @@ SAME_ROTATION_RAD = 1e-6
 """Ten digits of a file leave 2e-9 rad; corrected poses differ by more."""
 
 
+STILL_MM, STILL_RAD = 1e-6, 1e-9
+"""Travel up to which a manipulator stands still: what rounding in a table leaves."""
+
+
+def travel(R: Array, t: Array) -> tuple[float, float]:
+    """(mm, rad): farthest that poses R (n, 3, 3), t (n, 3) are from the first of them."""
+    return float(np.abs(t - t[0]).max()), float(rotation_angle_between(R[0], R).max())
+
+
 @dataclass(frozen=True, kw_only=True)
 class Problem:
     """n observed centres with the poses they belong to, in the poses' order.
