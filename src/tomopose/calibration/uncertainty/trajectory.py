@@ -18,6 +18,8 @@ from tomopose.manipulator.poses import PoseSequence
 from tomopose.units import Array
 
 POSE_STEPS = 12
+RANK = 1e-9
+"""Singular values of a rigid pose's columns, relative to the largest, that still move a point."""
 
 
 def object_points(half: tuple[float, float, float] = (15.0, 15.0, 30.0)) -> Array:
@@ -136,7 +138,9 @@ def _columns(calibration: Calibration, poses: PoseSequence, x_M: Array) -> tuple
         )
         J[..., c:] = of_q.reshape(n, m, 2, -1)
     G = rigid_pose.reshape(-1, 6)
-    Q, _ = np.linalg.qr(G / np.linalg.norm(G, axis=0))
+    # two points, or points in a line, leave a turn about it without effect: that is no direction to take out
+    U, size, _ = np.linalg.svd(G / np.maximum(np.linalg.norm(G, axis=0), 1e-300), full_matrices=False)
+    Q = U[:, size > RANK * size[0]]
     flat = J.reshape(-1, J.shape[3])
     flat = flat - Q @ (Q.T @ flat)
     return flat.reshape(J.shape), J_pose
