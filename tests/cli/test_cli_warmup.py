@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
+import time
 
 import numba
 import pytest
@@ -51,10 +53,22 @@ def test_a_note_that_cannot_be_read_counts_as_none(folder, text):
 def test_what_is_noted_is_not_compiled_again(folder, monkeypatch, capsys):
     warmup.note_done(warmup.JOBS)
     monkeypatch.setattr(warmup, "ProcessPoolExecutor", None)
+    monkeypatch.setattr(warmup, "multiprocessing", None)
     assert run(["warmup", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"folder": str(folder), "compiled": list(warmup.JOBS)}
     with warmup.compiled_while("simulate", beside=("detect", "calibrate")):
         assert warmup.compiled_jobs() == set(warmup.JOBS)
+
+
+def test_work_that_fails_does_not_wait_for_what_is_compiled_beside_it(folder, monkeypatch):
+    monkeypatch.setattr(warmup, "run_jobs", time.sleep)  # waits for ever, given the jobs as seconds
+    monkeypatch.setattr(warmup, "tuple", lambda missing: 3600.0, raising=False)
+    with pytest.raises(KeyboardInterrupt), warmup.compiled_while("simulate", beside=("detect",)):
+        raise KeyboardInterrupt
+    assert warmup.compiled_jobs() == set()
+    for process in multiprocessing.active_children():
+        process.join(60)
+    assert multiprocessing.active_children() == []
 
 
 def test_doctor_says_what_is_compiled(folder, capsys):

@@ -146,12 +146,21 @@ def compiled_while(here: str, *, beside: Sequence[str]) -> Iterator[None]:
     if not missing or kernel_cache.kept_in(PACKAGE) is None:
         yield
         return
-    with ProcessPoolExecutor(max_workers=1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        waiting = [pool.submit(run_job, name) for name in missing]
+    other = multiprocessing.get_context("spawn").Process(target=run_jobs, args=(tuple(missing),), daemon=True)
+    other.start()
+    try:
         yield
-        for future in waiting:
-            future.result()
-    note_done([here, *missing])
+        other.join()
+    finally:
+        other.terminate()  # nobody waits for it where the caller's work has failed or was interrupted
+    if other.exitcode == 0:
+        note_done([here, *missing])
+
+
+def run_jobs(names: Sequence[str]) -> None:
+    """Jobs one after the other."""
+    for name in names:
+        run_job(name)
 
 
 def run_job(name: str) -> None:
