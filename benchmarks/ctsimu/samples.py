@@ -145,7 +145,10 @@ class StepWedge:
         return shape & (outer - inner)
 
     def whole(self, material: str) -> tuple[Solid, ...]:
-        return tuple(Solid(shape=self.step(k, LEFT, RIGHT), material=material, frame=Frame.W) for k in range(1, 10))
+        steps = {"Al": ALUMINIUM, "Fe": IRON}[material]
+        return tuple(
+            Solid(shape=self.step(k, LEFT, RIGHT, steps), material=material, frame=Frame.W) for k in range(1, 10)
+        )
 
     def halves(self, left: str, right: str) -> tuple[Solid, ...]:
         """2D-SW-3: a left piece with a straight edge at x = 500; a right piece that leaves a gap above, touches in the
