@@ -217,6 +217,13 @@ def test_an_alternative_that_identified_errors_explain_is_dropped():
     assert judge(findings(replace(e, diagnosis=better, residual_px=0.0005, expected_px=0.0005)))[0] == "trustworthy"
 
 
+def test_a_movement_is_a_symptom_where_the_declared_reading_does_not_fit():
+    e = clean()
+    shifted = replace(e, **moved(e, at="100"))
+    assert [f.rule for f in findings(shifted)] == ["step"]
+    assert findings(replace(shifted, diagnosis=with_readings(declared={"sigmas": 400.0}))) == ()
+
+
 def test_effects_need_a_share_of_chi2_where_residuals_are_not_white():
     e = clean("kinematic")
     assert e.stability is not None

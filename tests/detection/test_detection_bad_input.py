@@ -258,6 +258,7 @@ def test_diameter_that_no_image_of_a_run_shows(scene: Scene, clean: Array) -> No
     images = [counts(clean, seed=seed) for seed in range(5)]
     right = detect(images, scene.scanner, ball_diameter=2 * scene.radius)
     assert set(right.status or ()) == {"ok"}
+    assert right.ball_diameter == 2 * scene.radius
     larger = detect(images, scene.scanner, ball_diameter=2.06 * scene.radius)
     assert set(larger.status or ()) == {"radius off nominal"}
     with pytest.raises(InputError, match="d_SD, d_SR, a pixel pitch or the diameter is wrong"):
