@@ -59,7 +59,7 @@ def parameters_section(calibration: Calibration) -> Section:
     )
     lead = "How the manipulator sits on the table, and where the ball is."
     if calibration.inverse:
-        lead = "How the scanner sits on the moved plate, and where the ball stands."
+        lead = "How the scanner sits on the moved plate, and where the ball is."
     elif calibration.arrangement == "turntable":
         lead = "The panel against the table's axis, and where the balls are on the table; T_HT is the identity."
     return Section(title="What was found", lead=lead, blocks=blocks)
