@@ -11,6 +11,7 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 
+from tomopose.calibration.model.budget import ScanBudget
 from tomopose.calibration.records.decisions import Decision
 from tomopose.calibration.result import ModelComparison, ModelJudgement
 from tomopose.errors import FileError, ShapeError
@@ -195,6 +196,25 @@ def test_the_first_screen_answers_four_questions(sample, verdict, use):
     assert words[0].startswith(use)
     assert all(w.strip().endswith(".") for w in words)
     assert "0.8" in words[1]  # of 0.832 um, the largest uncertainty of the mount
+
+
+def limiting(html: str) -> str:
+    asked = re.search(r'<dl class="answers">(.*?)</dl>', html, re.S)[1]
+    return re.findall(r"<dd>(.*?)</dd>", asked, re.S)[2]
+
+
+@pytest.mark.parametrize(
+    ("measured", "shares", "words"),
+    [
+        (0.2, (("u_0", 0.05), ("d_SR", 0.04)), "The measurement itself: 0.200 px of 0.210 px."),
+        (0.002, (("u_0", 0.14), ("d_SR", 0.12), ("d_SD", 0.1)), "most of all u_0 (piercing point, along u): 44 % of"),
+    ],
+)
+def test_what_limits_a_calibration_is_the_larger_part(sample, measured, shares, words):
+    calibration, observations, poses = sample()
+    budget = ScanBudget(total=0.21, measured=measured, shares=shares)
+    html = calibration_report(dataclasses.replace(calibration, budget=budget), observations=observations, poses=poses)
+    assert words in limiting(html)
 
 
 @pytest.mark.parametrize(

@@ -59,12 +59,13 @@ def _limits(calibration: Calibration) -> str:
     budget = calibration.budget
     if budget is None or not budget.shares or not budget.total > 0:
         return "Detection noise and the number of poses; nothing that was assumed adds to it here."
-    name, px = budget.shares[0]
-    share = 100 * (px / budget.total) ** 2
-    if share < 50:
+    if budget.measured**2 >= budget.total**2 / 2:
         return f"The measurement itself: {number(budget.measured)} px of {number(budget.total)} px."
-    what = meaning(name)
-    return f"{name}{f' ({what})' if what else ''}, which was assumed: {share:.0f} % of the variance."
+    name, px = budget.shares[0]
+    what = f" ({meaning(name)})" if meaning(name) else ""
+    share, rest = 100 * (px / budget.total) ** 2, len(budget.shares) - 1
+    more = f"; {rest} more assumed values add to it" if rest else ""
+    return f"What was assumed and not measured, most of all {name}{what}: {share:.0f} % of the variance{more}."
 
 
 def _help(calibration: Calibration) -> str:
@@ -75,7 +76,8 @@ def _help(calibration: Calibration) -> str:
     if budget is not None and budget.two_angles is not None and budget.two_angles < 0.5 * budget.total:
         return f"Poses at a second table angle: the scan would carry {number(budget.two_angles)} px."
     if calibration.observability.notes:
-        return _sentence(calibration.observability.notes[0])
+        note = calibration.observability.notes[0]
+        return _sentence(note[:1].upper() + note[1:])
     return "No single change was found that would help much."
 
 
