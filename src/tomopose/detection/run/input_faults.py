@@ -36,7 +36,7 @@ def fault_of_input(image: Image, scanner: Scanner, **options: Any) -> InputError
     return None
 
 
-def bytes_are_exchanged(image: Image) -> bool:
+def bytes_are_exchanged(image: Any) -> bool:
     """Whether an image of 16-bit counts is far smoother along its rows with every pixel's bytes exchanged."""
     step = max(1, int(image.shape[0]) // SAMPLED_ROWS)
     whole = hasattr(image, "region")

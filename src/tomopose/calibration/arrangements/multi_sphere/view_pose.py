@@ -131,7 +131,7 @@ def _gauss_newton(
     P = scanner.P_S @ scanner.T_WS.matrix
     R, t = start.R, start.t
     r, A = _weighted(P, R, t, x_D, balls, W)
-    z = (W @ r[:, :, None]).ravel()
+    z = np.asarray(W @ r[:, :, None], dtype=np.float64).ravel()
     chi2 = float(z @ z) if np.isfinite(z).all() else np.inf
     damping, still = 1e-4, False
     for _ in range(steps):
@@ -140,9 +140,9 @@ def _gauss_newton(
         N = A.T @ A
         N[np.diag_indices(6)] *= 1 + damping
         step: Array = np.linalg.solve(N, A.T @ z)
-        R_new, t_new = exp_rotation(step[:3]) @ R, t + step[3:]
+        R_new, t_new = np.asarray(exp_rotation(step[:3]) @ R, dtype=np.float64), t + step[3:]
         r_new, A_new = _weighted(P, R_new, t_new, x_D, balls, W)
-        z_new = (W @ r_new[:, :, None]).ravel()
+        z_new = np.asarray(W @ r_new[:, :, None], dtype=np.float64).ravel()
         chi2_new = float(z_new @ z_new) if np.isfinite(z_new).all() else np.inf
         if chi2_new <= chi2 * (1 + 1e-12) + 1e-18:
             still = bool(np.abs(A @ step).max() < TOLERANCE * max(1.0, np.sqrt(chi2)) or chi2 - chi2_new < 1e-9)
