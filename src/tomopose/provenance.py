@@ -7,15 +7,17 @@ import hashlib
 import importlib.metadata
 import platform
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from tomopose.values import value
+
 DEPENDENCIES = ("numpy", "scipy", "numba", "tifffile", "h5py")
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Provenance:
     """Who made a result, from what, when.
 

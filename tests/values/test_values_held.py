@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import pickle
 import sys
+import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from tomopose import BallObservations, PoseSequence, ProjectionMatrices, RigidTransform, Scanner, Volume, VoxelGrid
+from tomopose import (
+    BallObservations,
+    PoseSequence,
+    ProjectionMatrices,
+    RigidTransform,
+    Scanner,
+    Volume,
+    VoxelGrid,
+    read_calibration,
+)
 from tomopose.errors import EngineMissingError, InputError
 from tomopose.geometry.frames import Frame
 from tomopose.values import equal
@@ -49,7 +60,14 @@ def make_volume():
     return Volume(np.arange(24, dtype=np.float32).reshape(2, 3, 4), VoxelGrid((2, 3, 4), 0.1))
 
 
-MAKERS = [make_poses, make_observations, make_matrices, make_scanner, make_transform, make_volume]
+def make_calibration():
+    """One with an identified hexapod: every block is there."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return read_calibration(Path(__file__).parents[1] / "io" / "files" / "calibration-1-hexapod.json")
+
+
+MAKERS = [make_poses, make_observations, make_matrices, make_scanner, make_transform, make_volume, make_calibration]
 SEQUENCES = [make_poses, make_observations, make_matrices]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
@@ -24,14 +24,14 @@ from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.error_models import Errors, RigidErrors
 from tomopose.provenance import Provenance
 from tomopose.units import Array, float_array, value_with_uncertainty
-from tomopose.values import verdict_html
+from tomopose.values import value, verdict_html
 
 Arrangement: TypeAlias = Literal["moving-object", "moving-scanner", "twin", "turntable"]
 ARRANGEMENTS: tuple[Arrangement, ...] = get_args(Arrangement)
 SCANNER_MOVES: tuple[Arrangement, ...] = ("moving-scanner", "twin")
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Parameter:
     """One estimated number: value, standard uncertainty u (nan: not determinable), unit; `free` or held."""
 
@@ -41,7 +41,7 @@ class Parameter:
     unit: str
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class PoseNoiseFound:
     """Scatter of the poses beside detection noise, a coordinate each: translation mm, rotation rad; gain: how much
     -2 log L falls by it; chi2/dof with it and without; found: the residuals show it, else they leave room for it."""
@@ -54,7 +54,7 @@ class PoseNoiseFound:
     found: bool = True
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class ModelJudgement:
     """How one model of the manipulator did.
 
@@ -75,7 +75,7 @@ class ModelJudgement:
     size: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class RotationResiduals:
     """Residuals of n poses turned about one axis: model -> rms distance in px, and in um at the object."""
 
@@ -85,7 +85,7 @@ class RotationResiduals:
     um: Mapping[str, float]
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class ModelComparison:
     """The models side by side, and the residuals of the first and the chosen one by axis of rotation."""
 
@@ -94,7 +94,7 @@ class ModelComparison:
     by_rotation: tuple[RotationResiduals, ...] = ()
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class ViewDistances:
     """d_SD of every view, (n,) mm, with its standard uncertainty u (n,), where it scatters by `sigma` mm a view."""
 
@@ -104,7 +104,7 @@ class ViewDistances:
     u: Array
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Calibration:
     """How the manipulator sits in the scanner.  Eq. (7) solved.
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from tomopose.detection.finder.find import Candidate
 from tomopose.units import Array
+from tomopose.values import value
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class BallImage:
     """The ball in one radiograph; positions in D, px.
 

@@ -29,7 +29,7 @@ from tomopose.manipulator.run_effects import with_run_effects
 from tomopose.manipulator.serial import SerialRobot
 from tomopose.manipulator.twin import TwinRobots, twin_names
 from tomopose.units import Array, float_array
-from tomopose.values import require_types
+from tomopose.values import require_types, value
 
 RANGE_MARGIN = 0.1
 """Of the calibrated range's width: as far outside a pose still counts as inside."""
@@ -38,7 +38,7 @@ COMMAND_TOLERANCE = 1e-9
 """mm, and rad at 1000 mm."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class PoseScatter:
     """Standard deviations of the plate from pose to pose along H: t (3,) mm of its origin, w (3,) rad of its turns.
 
@@ -59,7 +59,7 @@ class PoseScatter:
         return np.concatenate([self.w**2, self.t**2])
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class PoseRange:
     """Lowest and highest shift t (3,) mm and rotation vector w (3,) rad of a pose table."""
 
@@ -81,7 +81,7 @@ class PoseRange:
         return ((x < low - margin) | (x > high + margin)).any(axis=1)
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Lag:
     """Worn guides and drives: names and values (mm) of play, which follows the direction of each move."""
 
@@ -89,7 +89,7 @@ class Lag:
     values: Array
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class RigidErrors:
     """The poses are trusted.  translation_scale: factor on the plate's shifts; scatter: None where none is known."""
 
@@ -123,17 +123,17 @@ class MachineErrors:
         return self.machine.names
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class IdentifiedErrors(MachineErrors):
     """A hexapod or a robot (an InverseManipulator of one, where it carries the scanner) and the errors that it has."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class EmpiricalErrors(MachineErrors):
     """A map of pose errors of low order: nothing is known of the machine."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class TwinErrors:
     """Twin robots as in `TwinRobots`, without a pose table, and the errors that were found.
 

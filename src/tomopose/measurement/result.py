@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import Enum
 from typing import Any, Literal
 
 from tomopose.coverage import combined, expanded
+from tomopose.values import value
 
 FormKind = Literal["form", "form_95", "form_25"]
 FIT_ALONE = "fit alone, without the systematic part"
@@ -53,7 +54,7 @@ def decide_form(value: float, U: float, noise: float, limit: float) -> Decision:
     return Decision.NOT_CONFORMING if beyond else Decision.NOT_DECIDABLE
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class MeasurementResult:
     """One measurand in one volume.
 
@@ -150,7 +151,7 @@ class MeasurementResult:
         }
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Repeat:
     """A measurand over a group of n repeats: mean and standard deviation s.
 

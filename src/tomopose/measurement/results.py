@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from tomopose.measurement.features.feature import Feature
 from tomopose.measurement.result import Decision, MeasurementResult, Repeat
 from tomopose.measurement.uncertainty import Simulated
 from tomopose.provenance import Provenance
+from tomopose.values import value
 
 SCHEMA = "measurement"
 COLUMNS = (
@@ -63,7 +64,7 @@ BUDGET_COLUMNS = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class MeasurementResults:
     """Everything that `measure` found.
 

@@ -46,7 +46,7 @@ MOST_IMAGES = 400
 RESOLVING_ROUNDS = 8
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class PosePlan:
     """Poses to image, in order, the first repeated at the end.
 

@@ -10,20 +10,18 @@ met once like one that is met often, knows neither noise nor absorption, and tak
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.units import Array
-from tomopose.values import require_types
+from tomopose.values import require_types, value
 
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Completeness:
     """points (m, 3), mm, in W at home; share (m,): part of the planes through each point that meet the source path."""
 

@@ -30,6 +30,10 @@ T = TypeVar("T")
 Column = Sequence[object] | np.ndarray
 R = TypeVar("R", bound="Rows")
 
+WIDEST = 120
+MOST_LINES = 22
+"""Lines of a repr under its first: a screen of a terminal has 24."""
+
 SHOWN = 96
 """Characters of a field in a repr; longer ones are cut with an ellipsis, so that a value fits one screen."""
 
@@ -47,7 +51,18 @@ def equal(a: object, b: object) -> bool:
         return len(a) == len(b) and all(map(equal, a, b))
     if isinstance(a, float) and isinstance(b, float) and math.isnan(a):
         return math.isnan(b)
+    if _is_plain_dataclass(a):
+        return type(a) is type(b) and all(equal(x, y) for x, y in zip(_members(a), _members(b), strict=True))
     return bool(a == b)
+
+
+def _is_plain_dataclass(a: object) -> bool:
+    """Whether a value is a dataclass that compares its fields by ==, which arrays do not answer."""
+    return dataclasses.is_dataclass(a) and not isinstance(a, type) and type(a).__eq__ is not _eq
+
+
+def _members(a: object) -> list[object]:
+    return [getattr(a, f.name) for f in dataclasses.fields(a) if f.compare]  # type: ignore[arg-type]
 
 
 def content_hash(a: object) -> int:
@@ -63,6 +78,8 @@ def content_hash(a: object) -> int:
         return hash(tuple(map(content_hash, a)))
     if isinstance(a, float) and math.isnan(a):
         return hash("nan")
+    if _is_plain_dataclass(a):
+        return hash((type(a).__name__, *map(content_hash, _members(a))))
     return hash(a)
 
 
@@ -81,6 +98,7 @@ def shown(a: object) -> str:
         text = "{" + ", ".join(f"{k!r}: {shown(v)}" for k, v in a.items()) + "}"
     else:
         text = " ".join(repr(a).split())
+    text = " ".join(text.split())
     return text if len(text) <= SHOWN else text[: SHOWN - 1] + "\u2026"
 
 
@@ -92,7 +110,10 @@ def _fields(value: object) -> list[tuple[str, object]]:
 
 def _repr(self: object) -> str:
     size = f" of {len(self)}" if isinstance(self, Rows) else ""
-    lines = [f"  {name} = {shown(held)}" for name, held in _fields(self)]
+    lines = [f"  {name} = {shown(held)}"[:WIDEST] for name, held in _fields(self)]
+    if len(lines) > MOST_LINES:
+        more = len(lines) - MOST_LINES + 1
+        lines[MOST_LINES - 1 :] = [f"  and {more} more fields"]
     return "\n".join([f"{type(self).__name__}{size}", *lines])
 
 

@@ -41,7 +41,7 @@ from tomopose.manipulator.inverse import inverse_poses
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.units import Array
-from tomopose.values import require_types
+from tomopose.values import require_types, value
 
 SAME, BETTER = 9.0, 25.0
 """delta below SAME (3 sigma): cannot be distinguished.  delta below -BETTER (5 sigma): the alternative fits better."""
@@ -91,7 +91,7 @@ WORDS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Hypothesis:
     """An alternative reading of the data, fitted.
 
@@ -160,7 +160,7 @@ class Hypothesis:
         }
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Diagnosis:
     """Hypotheses ranked by fit, best first; the declared reading is among them.
 

@@ -8,7 +8,6 @@ an F test against what it leaves.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from datetime import datetime
 from math import comb
 
@@ -24,6 +23,7 @@ from tomopose.calibration.rigid.fit import Fit, linear_fit
 from tomopose.geometry.extent import largest_distance
 from tomopose.geometry.rotations import rotation_angle_between
 from tomopose.units import Array
+from tomopose.values import value
 
 DRIFT_ORDER = 3
 REPEATED_MM, REPEATED_RAD = 0.02, 2e-4
@@ -31,7 +31,7 @@ SIGNIFICANT = 1e-4
 """Probability below which an effect is called significant (for a change point, over all its places together)."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Effect:
     """Something that moved.
 
@@ -48,7 +48,7 @@ class Effect:
     at: str = ""
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class RepeatedPose:
     """A pose taken again: the distance of its two centres in px and in standard deviations."""
 
@@ -58,7 +58,7 @@ class RepeatedPose:
     sigmas: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class OutlierBlock:
     """A run of neighbouring poses, `first` to `last`, whose centres were all set aside; p: probability by chance."""
 
@@ -68,7 +68,7 @@ class OutlierBlock:
     p: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Stability:
     """effects: drift and change points (significant or not);  repeats: poses taken twice, set aside or not;
     block: the longest run of poses set aside;  held_out_rms, fit_rms: px, blocked cross-validation beside the fit;

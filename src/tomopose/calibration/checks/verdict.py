@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Literal, TypeAlias, get_args
 
 from tomopose.errors import ShapeError
+from tomopose.values import value
 
 Verdict: TypeAlias = Literal["trustworthy", "doubtful", "rejected"]
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 """From the best to the worst."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Finding:
     """What one rule found.
 

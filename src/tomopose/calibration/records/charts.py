@@ -15,7 +15,7 @@ from scipy.special import ndtr, stdtr, stdtrit
 from tomopose.calibration.records.history import Entry
 from tomopose.errors import InputError
 from tomopose.units import Array
-from tomopose.values import require_types
+from tomopose.values import require_types, value
 
 LIMIT_SIGMAS = 3.0
 """Limits hold a run with the probability of three standard deviations of a normal value, 0.9973; a scatter that is
@@ -64,7 +64,7 @@ def series(entries: Iterable[Entry], name: str) -> Series:
     return Series(name=name, unit=unit, value=values, u=np.maximum(u, least), place=np.array(place, dtype=np.intp))
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class ControlChart:
     """One number over the history.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,14 +13,14 @@ from tomopose.errors import InputError
 from tomopose.geometry.rotations import log_rotation
 from tomopose.manipulator.poses import PIVOT_TOLERANCE_MM
 from tomopose.units import Array
-from tomopose.values import require_types
+from tomopose.values import require_types, value
 
 SIGNIFICANT = 0.01
 NOT_TESTED = (float("nan"), float("nan"))
 MOUNT = tuple(f"{what}_HT_{c}" for what in "wt" for c in "xyz")
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Comparison:
     """b minus a.
 

@@ -7,7 +7,6 @@ prior.  The truth is the calibration itself, so that the spread of the solutions
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,13 +22,13 @@ from tomopose.geometry.scanner import Scanner
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.units import Array
-from tomopose.values import require_types
+from tomopose.values import require_types, value
 
 BATCH = 2000
 ITERATIONS = 20
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class MonteCarlo:
     """errors (b, m): estimate minus truth in the coordinates `names` (w_HT as rotation vector);  chi2 (b,);
     converged (b,) bool;  seed."""

@@ -130,4 +130,5 @@ def length_sigma(calibration: Calibration, poses: PoseSequence, x_a: ArrayLike, 
     along = (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True)
     B, C = scan_displacement(calibration, poses, np.concatenate([a, b]))
     g = np.einsum("ma,mac->mc", along, B[len(a) :] - B[: len(a)])
-    return np.sqrt(np.einsum("mc,cd,md->m", g, C, g))
+    sigma: Array = np.sqrt(np.einsum("mc,cd,md->m", g, C, g))
+    return sigma

@@ -248,8 +248,8 @@ def _fetch(images: Any, i: int, task: Task, scanner: Scanner) -> None:
         images.fetch(i, v0, v1)
 
 
-def _origin_of(origin: npt.ArrayLike, index: int) -> tuple[int, int]:
-    pair = origin if np.ndim(origin) == 1 else origin[index]
+def _origin_of(origin: tuple[int, int] | Sequence[tuple[int, int]], index: int) -> tuple[int, int]:
+    pair: Any = origin if np.ndim(origin) == 1 else origin[index]
     return pair[0], pair[1]
 
 

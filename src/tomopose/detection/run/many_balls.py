@@ -9,7 +9,7 @@ from functools import partial
 
 from tomopose.detection.finder.find import Candidate, find_balls, refuse_hidden
 from tomopose.detection.flags import expected_radius
-from tomopose.detection.image import checked_diameter, measured_ball, require_types
+from tomopose.detection.image import checked_diameter, measured_ball
 from tomopose.detection.reading import Image, Mask, Pixels, checked_shape, read_pixels
 from tomopose.detection.result import BallImage
 from tomopose.detection.run.executors import ordered_map
@@ -17,6 +17,7 @@ from tomopose.detection.run.rows import LazyImage
 from tomopose.detection.settings import DEFAULT, DetectionSettings
 from tomopose.errors import DetectionError, InputError, TomoposeError
 from tomopose.geometry.scanner import Scanner
+from tomopose.values import require_types
 
 CLEAR_PX = 6.0
 """Width of the ring outside a rim that the fit needs free of another ball: the blur's width on either side and the
@@ -38,6 +39,7 @@ class BallsInImage:
     fault: str = ""
 
 
+@require_types
 def detect_balls(
     images: Iterable[Image],
     scanner: Scanner,
@@ -63,7 +65,6 @@ def detect_balls(
 
     Raises InputError where no image can be read.
     """
-    require_types(scanner, settings)
     diameters = [checked_diameter(float(d)) for d in ball_diameters]
     if not diameters:
         raise InputError("ball_diameters is empty; give the diameter of each ball of the object")

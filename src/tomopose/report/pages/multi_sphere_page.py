@@ -42,7 +42,7 @@ def multi_sphere_report(result: MultiSphereCalibration, *, title: str = "Multi-s
                 KeyFigure(name="Balls a view", value=f"{result.balls_used.min()} to {result.balls_used.max()}"),
                 KeyFigure(
                     name="Uncertainty of a view",
-                    value=f"{number(np.sqrt(np.mean(np.square(matrices.points_sigma))))} px",
+                    value=f"{number(np.sqrt(np.mean(np.square(np.asarray(matrices.points_sigma)))))} px",
                     note="1 sigma, rms over the field of view",
                 ),
             ],

@@ -113,7 +113,7 @@ def solve_path(
             chi2 += part.chi2
             parts.append(part)
             residuals.append(part.residuals)
-        C: Array = np.linalg.inv(S)
+        C = np.asarray(np.linalg.inv(S), dtype=np.float64)
         if largest < STILL:
             return PathSolution(
                 scanner=scanner,
