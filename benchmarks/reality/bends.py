@@ -30,7 +30,7 @@ class Bend:
     world: Callable[[World, np.random.Generator, int], None] | None = None
     data: Callable[[Data, np.random.Generator], None] | None = None
     names: tuple[str, ...] = ()
-    where: tuple[str, ...] = ("hexapod", "robot", "moving")
+    where: tuple[str, ...] = ("hexapod", "two balls", "robot", "moving")
 
 
 def panel(name: str, key: str, values: list[tuple[str, float]], names: tuple[str, ...], where=None) -> list[Bend]:
@@ -110,7 +110,7 @@ def _sign(d: Data, rng, v) -> None:
     d.w = d.w * np.where(np.arange(3) == v, -1, 1)
 
 
-TABLE = ("hexapod",)
+TABLE = ("hexapod", "two balls")
 BENDS: list[Bend] = [
     *panel(
         "roll", "eta", [("0.02 deg", 0.02 * DEG), ("0.05 deg", 0.05 * DEG), ("0.2 deg", 0.2 * DEG)], ("eta", "roll")
@@ -118,7 +118,7 @@ BENDS: list[Bend] = [
     *panel("tilt theta", "theta", [("0.05 deg", 0.05 * DEG), ("0.3 deg", 0.3 * DEG)], ("theta", "tilt")),
     *panel("tilt phi", "phi", [("0.05 deg", 0.05 * DEG), ("0.3 deg", 0.3 * DEG)], ("phi", "tilt")),
     *panel("d_SD", "d_SD", [("0.5 mm", 0.5), ("3 mm", 3.0)], ("d_SD", "pitch", "p_u", "p_v")),
-    *panel("d_SR", "d_SR", [("0.05 mm", 0.05), ("0.5 mm", 0.5)], ("d_SR",), where=("hexapod", "robot")),
+    *panel("d_SR", "d_SR", [("0.05 mm", 0.05), ("0.5 mm", 0.5)], ("d_SR",), where=("hexapod", "two balls")),
     *panel("u_0", "u_0", [("0.3 px", 0.3), ("1.5 px", 1.5)], ("u_0", "axis")),
     *panel("v_0", "v_0", [("0.3 px", 0.3), ("1.5 px", 1.5)], ("v_0", "theta", "tilt")),
     *panel("pitch of u", "p_u", [("1e-4", 2e-5), ("1e-3", 2e-4)], ("p_u", "pitch")),

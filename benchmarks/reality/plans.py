@@ -59,12 +59,6 @@ def robot(rng: np.random.Generator, n: int = 90) -> Poses:
     return Poses(w[again], t[again], np.zeros(n + 1), np.zeros(n + 1, int))
 
 
-def turntable(n: int = 40) -> Poses:
-    """Nothing but a table that turns, four balls on it."""
-    alpha = np.tile(np.linspace(0, 2 * np.pi, n, endpoint=False), 4)
-    return Poses(np.zeros((4 * n, 3)), np.zeros((4 * n, 3)), alpha, np.repeat(np.arange(4), n))
-
-
 def hexapod_scan() -> Poses:
     """A tilted scan: one turn of the table, plate tilted to and fro by 5 degrees."""
     alpha = np.linspace(0, 2 * np.pi, 24, endpoint=False)
@@ -111,7 +105,6 @@ def world(kind: str, rng: np.random.Generator) -> tuple[World, np.ndarray]:
     if kind == "moving":
         # the object is 600 mm before the plate's zero; the scanner is seen from the plate
         return World(R_HT=R_HT, t_HT=t_HT, moving=True), balls
-    if kind == "turntable":
-        balls = rng.uniform(-12, 12, (4, 3)) + np.array([0, 0, 1.0]) * np.array([[-15.0], [-5.0], [5.0], [15.0]])
-        return World(R_HT=np.eye(3), t_HT=np.zeros(3)), balls
+    if kind == "two balls":
+        balls = np.concatenate([balls, [[-12.0, 8.0, -11.0]] + rng.uniform(-2, 2, (1, 3))])
     return World(R_HT=R_HT, t_HT=t_HT), balls

@@ -11,11 +11,18 @@ import numpy as np
 import pytest
 
 from tomopose.calibration.checks.convention_tests import Diagnosis, Hypothesis
-from tomopose.calibration.checks.evidence.evidence import AgainstRigid, BallSize, Evidence, ScatterFound
+from tomopose.calibration.checks.evidence.evidence import (
+    AgainstRigid,
+    BallSize,
+    Evidence,
+    ScatterFound,
+    Undistinguished,
+)
 from tomopose.calibration.checks.rules import ARRANGEMENTS, MODELS, RULES, findings, rules_table
 from tomopose.calibration.checks.scanner_tests import Explanation, Ranked, ScannerTests, Single
 from tomopose.calibration.checks.stability import Effect, OutlierBlock, RepeatedPose, Stability
 from tomopose.calibration.checks.verdict import VERDICTS, Finding, judge
+from tomopose.calibration.model.budget import Halves
 from tomopose.calibration.rigid.contradiction import Contradicted
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "concepts" / "verdict.md"
@@ -108,7 +115,8 @@ def run_tests(
 ) -> ScannerTests:
     """Tests of a run: what is left beside everything assumed; a scanner value of that size and another effect which
     explain equally well why the declared values do not fit."""
-    equal = () if single is None else ((single[0], single[1], single[2]), (other, "manipulator", 1e-3))
+    kind, size = ("convention", 0.5) if other == "pixel origin" else ("manipulator", 1e-3)
+    equal = () if single is None else (single, (other, kind, size))
     singles = tuple(Single(name=n, short=n, kind=k, evidence=60.0, size=s) for n, k, s in equal)
 
     def ranked(chosen: tuple[Explanation, ...]) -> Ranked:
@@ -157,6 +165,20 @@ def met(name: str, e: Evidence) -> Mapping[str, Any]:
         "changed during the run": {"tests": run_tests(left=explained("mount step", "step", at="56"))},
         "scanner or manipulator not as modelled": {"tests": run_tests(left=explained("radial distortion", "panel"))},
         "value freed": {"contradicted": (Contradicted(name="d_SR", stated=0.15, off=0.9),)},
+        "convention not distinguished": {
+            "undistinguished": (Undistinguished(name="order ZYX", words="other angles", remedy="", px=0.9),)
+        },
+        "halves of the poses": {
+            "halves": Halves(
+                x_D=np.zeros((1, 2)),
+                difference=np.ones((1, 2)),
+                sigma=np.ones((1, 2)),
+                rms_px=0.3,
+                stated_px=0.1,
+                p=1e-6,
+            )
+        },
+        "origin of the pixels": {"tests": run_tests(single=("u_0", "scanner", 0.49), other="pixel origin")},
         "two explanations": {"tests": run_tests(single=("d_SR", "scanner", 0.9), other="translation_scale")},
         "repeated pose": {"stability": repeat(e)},
         "repeated pose, set aside": {"stability": repeat(e), "outliers": ("188",)},

@@ -214,8 +214,7 @@ def test_one_more_number_a_view(gantry, scanner, rng):
     tp.write_observations(folder / "o.csv", tp.BallObservations.from_sigma(x, SIGMA, pose_id=poses.pose_id))
     write_manipulator(folder / "robot.json", robot)
     more = ("--arrangement", "moving-scanner", "--manipulator", folder / "robot.json", "--model", "rigid")
-    # With d_SD taken as fixed, its scatter is stated as the manipulator's.
-    assert calibrate(folder, "fixed", *more) == 0
+    assert calibrate(folder, "fixed", *more) == 3, "a d_SD that is not fixed shows"
     assert calibrate(folder, "free", *more, "--d-sd-sigma-mm", "0.5") == 0
     cal = tp.read_calibration(folder / "free" / "calibration.json")
     fixed = tp.read_calibration(folder / "fixed" / "calibration.json")

@@ -9,7 +9,13 @@ import numpy as np
 
 from tomopose.calibration.checks.ball_size import measured_ball_size, require_ball_size
 from tomopose.calibration.checks.convention_tests import Diagnosis
-from tomopose.calibration.checks.evidence.evidence import AgainstRigid, BallSize, Evidence, ScatterFound
+from tomopose.calibration.checks.evidence.evidence import (
+    AgainstRigid,
+    BallSize,
+    Evidence,
+    ScatterFound,
+    Undistinguished,
+)
 from tomopose.calibration.checks.rules import findings
 from tomopose.calibration.checks.scanner_tests import ScannerTests
 from tomopose.calibration.checks.stability import stability
@@ -31,7 +37,8 @@ from tomopose.calibration.result import (
 from tomopose.calibration.rigid.contradiction import Contradicted
 from tomopose.calibration.rigid.fit import tangent_names
 from tomopose.calibration.rigid.observability import Observability
-from tomopose.calibration.uncertainty.scan_budget import scan_budget
+from tomopose.calibration.uncertainty.halves import halves_of
+from tomopose.calibration.uncertainty.scan_budget import reference_of, scan_budget
 from tomopose.geometry.rotations import angles_from_rotation
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
@@ -67,6 +74,7 @@ class Fitted:
     assumed:      of the scanner;  contradicted: values of it that were freed.
     tests:        one effect after the other, or None where they do not apply.
     unseen, budget: as of the result.
+    undistinguished: readings of the orientation columns that the poses cannot distinguish.
     """
 
     everything: Problem
@@ -106,6 +114,7 @@ class Fitted:
     contradicted: tuple[Contradicted, ...] = ()
     tests: ScannerTests | None = None
     unseen: Unseen | None = None
+    undistinguished: tuple[Undistinguished, ...] = ()
     provenance: Provenance | None = None
 
 
@@ -150,7 +159,11 @@ def build(f: Fitted) -> Calibration:
         convention=used.convention,
         provenance=f.provenance,
     )
-    result = replace(result, budget=scan_budget(result, used, f.linear))
+    scan = reference_of(result, used)
+    result = replace(result, budget=scan_budget(result, used, f.linear, scan))
+    if scan is not None:
+        J = scan.J[:, :, : len(result.tangent)]
+        result = replace(result, halves=halves_of(f.linear, J, scan.x_D, widening=f.widening))
     result = replace(result, stability=stability(f.linear, f.T_HT.R, f.everything, f.keep))
     evidence = evidence_of(f, result)
     judged = replace(result, checks=findings(evidence))
@@ -182,6 +195,8 @@ def evidence_of(f: Fitted, result: Calibration) -> Evidence:
         scan_px=None if result.budget is None else result.budget.measured,
         tests=f.tests,
         contradicted=f.contradicted,
+        undistinguished=f.undistinguished,
+        halves=result.halves,
         diagnosis=f.diagnosis,
         stability=result.stability,
         scatter=more.scatter,
@@ -210,6 +225,9 @@ def ball_size_of(f: Fitted) -> BallSize | None:
 def parameter_list(f: Fitted) -> tuple[Parameter, ...]:
     """The estimated numbers with their standard uncertainties: angles of T_HT, t_HT, balls, freed ones, errors."""
     C, R = f.covariance, f.T_HT.R
+    if f.unseen is not None:
+        # the estimate answers to what no ball shows by its gain
+        C = C + (f.unseen.gain * f.unseen.sigma**2) @ f.unseen.gain.T
     E = angles_by_tangent(R)
     u_angles = np.sqrt(np.einsum("ij,jk,ik->i", E, C[:3, :3], E))
     u = np.sqrt(np.maximum(np.diag(C), 0.0))

@@ -13,7 +13,7 @@ from tomopose.calibration.checks.scanner_tests import Explanation
 from tomopose.calibration.checks.stability import Stability
 from tomopose.calibration.checks.verdict import Finding, Verdict, judge
 from tomopose.calibration.model.assumed import Assumed
-from tomopose.calibration.model.budget import ScanBudget
+from tomopose.calibration.model.budget import Halves, ScanBudget
 from tomopose.calibration.model.unseen import Unseen
 from tomopose.calibration.rigid.contradiction import Contradicted
 from tomopose.calibration.rigid.observability import Observability
@@ -126,6 +126,7 @@ class Calibration:
     explanations: what explains best why the values as declared do not fit, and what is left, likeliest first.
     contradicted: values that were freed because the images contradict the sigma that was stated or assumed.
     budget:       what the uncertainty of a scan is made of.
+    halves:       how calibrations from two halves of the poses differ over the field of view.
     status:       a sentence; converged: whether an optimum was reached.
     checks:       the findings; `verdict` and `reasons` follow from them and from nothing else.
     hypotheses:   alternative conventions tried, ranked.
@@ -159,6 +160,7 @@ class Calibration:
     explanations: tuple[Explanation, ...] = ()
     contradicted: tuple[Contradicted, ...] = ()
     budget: ScanBudget | None = None
+    halves: Halves | None = None
     converged: bool = True
     status: str = ""
     checks: tuple[Finding, ...] = ()

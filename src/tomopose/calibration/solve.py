@@ -12,8 +12,10 @@ from tomopose.calibration.build import Fitted, build, expected_px, magnification
 from tomopose.calibration.checks.alternative import Alternative
 from tomopose.calibration.checks.convention_tests import Diagnosis, ranked, set_pose_alternative
 from tomopose.calibration.checks.conventions import ALTERNATIVES
+from tomopose.calibration.checks.evidence.evidence import Undistinguished
 from tomopose.calibration.checks.placement import require_on_panel
 from tomopose.calibration.checks.scanner_tests import ScannerTests, rows_to_test, scanner_tests
+from tomopose.calibration.checks.undistinguished import undistinguished_readings
 from tomopose.calibration.model.assumed import Assumed, scatter_assumed, taken_as_known, without_effect
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS
 from tomopose.calibration.model.covariance import inverse_information, widening
@@ -137,7 +139,8 @@ def _rigid(
             assumed=taken.assumed,
             contradicted=taken.contradicted,
             tests=_tests(stated),
-            unseen=_unseen(solution, linear, moving_scanner=arrangement == "moving-scanner"),
+            undistinguished=taken.undistinguished,
+            unseen=_unseen(solution, linear, moving_scanner=arrangement == "moving-scanner", exact=taken.exact),
             provenance=provenance(arguments=arguments),
         )
     )
@@ -145,10 +148,13 @@ def _rigid(
 
 @dataclass(frozen=True, kw_only=True)
 class Taken:
-    """assumed: of the scanner;  contradicted: values whose prior the images contradict, which were freed."""
+    """assumed: of the scanner;  contradicted: values whose prior the images contradict, which were freed;  exact: names
+    that the user holds;  undistinguished: readings of the orientation columns."""
 
     assumed: tuple[Assumed, ...]
     contradicted: tuple[Contradicted, ...] = ()
+    exact: tuple[str, ...] = ()
+    undistinguished: tuple[Undistinguished, ...] = ()
 
 
 def _tests(solution: Solution) -> ScannerTests | None:
@@ -169,7 +175,7 @@ FEWEST_TESTED = 10
 """Equations beyond the unknowns that the tests need."""
 
 
-def _unseen(solution: Solution, linear: LinearFit, *, moving_scanner: bool) -> Unseen:
+def _unseen(solution: Solution, linear: LinearFit, *, moving_scanner: bool, exact: tuple[str, ...]) -> Unseen:
     """What no ball shows of table and manipulator, and how the estimate answers to it."""
     p, fit = solution.used, solution.fit
     return unseen_of(
@@ -181,6 +187,7 @@ def _unseen(solution: Solution, linear: LinearFit, *, moving_scanner: bool) -> U
         origin=p.t_MH,
         alpha=p.alpha,
         moving_scanner=moving_scanner,
+        scale_known="translation_scale" in (*exact, *solution.free.names),
     )
 
 
@@ -214,7 +221,8 @@ def calibrate(
                   "rigid" without a manipulator, and otherwise what predicts held-out poses best.
     free:         "auto": a scanner value whose stated or assumed standard deviation the images contradict is freed,
                   and the first line says so; "none": none is; or names to estimate without a prior.
-    fix:          names of scanner values to hold: exact; see `parameters.UNITS`.
+    fix:          names of scanner values to hold: exact; see `parameters.UNITS`.  translation_scale: lengths of the
+                  manipulator's translations are exact.
     priors:       name -> prior standard deviation (mm, px, rad), in place of the scanner's.
     robust:       set aside centres that do not belong, and list them.
     hypotheses:   try the cheap alternative conventions (or those given) and say so in the verdict; all of them
@@ -371,13 +379,16 @@ def rigid_calibration(
         freed, against = free_parameters(problem.scanners, free=free, fix=fix), ()
         stated = solve(problem, freed, robust=robust)
     solution = with_pose_noise(stated, pose_noise, robust=robust, maker=maker)
-    diagnosis = None
+    diagnosis: Diagnosis | None = None
+    blind: tuple[Undistinguished, ...] = ()
     if hypotheses:
         other = set_pose_alternative(problem, poses)
         known = [*(ALTERNATIVES if isinstance(hypotheses, bool) else hypotheses), *([other] if other else [])]
         diagnosis = ranked(stated.used, freed, stated.fit, [a for a in known if a.quick], starts=0)
         if diagnosis.nothing_fits:
             diagnosis = ranked(stated.used, freed, stated.fit, known, starts=0)
+        if arrangement == "moving-object":
+            blind = undistinguished_readings(stated.used, freed, stated.fit, diagnosis, known)
     arguments = {
         "free": list(free),
         "fix": list(fix),
@@ -385,7 +396,12 @@ def rigid_calibration(
         "robust": robust,
         "pose_noise": pose_noise if pose_noise is None or isinstance(pose_noise, str) else list(pose_noise),
     }
-    taken = Taken(assumed=(*assumed, *_scatter_assumed(pose_noise, maker)), contradicted=against)
+    taken = Taken(
+        assumed=(*assumed, *_scatter_assumed(pose_noise, maker)),
+        contradicted=against,
+        exact=tuple(fix),
+        undistinguished=blind,
+    )
     found = _rigid(solution, stated, diagnosis, arrangement, arguments, taken)
     found = replace(found, scanner=replace(found.scanner, sigma=plain.scanner.sigma))
     if not found.converged:

@@ -107,7 +107,11 @@ def read_inputs(o: CalibrationOptions) -> Inputs:
     manipulator = None if o.manipulator is None else tp.read_manipulator(o.manipulator)
     twin = None if o.twin is None else read_twin(o.twin)
     # A table of joint values alone becomes poses by the robot's own kinematics.
-    poses = tp.read_poses(o.poses, forward=forward_of(manipulator if twin is None else twin.detector))
+    poses = tp.read_poses(
+        o.poses,
+        convention_confirmed=o.confirm_convention,
+        forward=forward_of(manipulator if twin is None else twin.detector),
+    )
     images = None
     if o.observations is not None:
         observations = tp.read_observations(o.observations).with_ball_diameter(o.ball_diameter)

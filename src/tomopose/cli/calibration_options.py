@@ -46,6 +46,13 @@ class CalibrationOptions(ObservedOptions, SpokenOptions):
     fix: Annotated[
         str | None, typer.Option("--fix", help="Parameters to hold although scanner.json gives them a sigma.")
     ] = None
+    confirm_convention: Annotated[
+        bool,
+        typer.Option(
+            "--confirm-convention",
+            help="The orientation columns are in the declared convention, although the poses fit another as well.",
+        ),
+    ] = False
     repeatability: Annotated[
         str | None,
         typer.Option(

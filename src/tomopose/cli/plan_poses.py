@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -267,7 +267,8 @@ def poses(options: Options) -> int:
     listing = None if o.commands is None else require_absent(o.out.with_suffix(SUFFIXES[o.commands]), force=o.force)
     plan = planned(o, None if o.scanner is None else tp.read_scanner(o.scanner))
     lines = [f"{o.out}: {len(plan.poses)} poses", *plan.lines]
-    tp.write_poses(o.out, plan.poses, force=o.force)
+    # whether the controller turns the plate as these angles mean is for its user to say
+    tp.write_poses(o.out, replace(plan.poses, convention_confirmed=False), force=o.force)
     if o.commands is not None and listing is not None:
         write_text(listing, command_list(plan.poses, o.commands))
         lines.append(f"  {listing}: the same poses as {o.commands}")

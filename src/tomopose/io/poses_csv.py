@@ -6,6 +6,7 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Literal, cast
@@ -52,11 +53,15 @@ def pose_columns(convention: Convention, *, commanded: bool = False) -> tuple[st
     return tuple(set_name(c) for c in names) if commanded else names
 
 
+CONFIRMED = "confirmed"
+
+
 @reader("pose table")
 def read_poses(
     path: str | Path,
     *,
     units_confirmed: bool = False,
+    convention_confirmed: bool = False,
     forward: Callable[[Array], RigidTransform] | None = None,
 ) -> PoseSequence:
     """Read poses.csv.
@@ -65,6 +70,8 @@ def read_poses(
     ----------
     path:             the table; columns and comment keys as in docs/formats/files.md.
     units_confirmed:  the numbers are right although they look like radians, metres or micrometres.
+    convention_confirmed: the orientation columns are in the convention of the table, whatever else fits as well; as
+                      `# convention: NAME, confirmed`.
     forward:          joint values q (n, m) (rad, mm) -> T_MH, for tables that hold joints and no pose.
 
     Raises
@@ -75,7 +82,8 @@ def read_poses(
     FileError
         If the file cannot be read.
     """
-    return poses_from_table(read_table(path), units_confirmed=units_confirmed, forward=forward)
+    found = poses_from_table(read_table(path), units_confirmed=units_confirmed, forward=forward)
+    return replace(found, convention_confirmed=True) if convention_confirmed else found
 
 
 def poses_from_table(
@@ -130,6 +138,7 @@ def poses_from_table(
         q=q,
         orientations=_orientations(table, convention),
         units_confirmed=confirmed,
+        convention_confirmed=_confirms_convention(table),
     )
 
 
@@ -138,9 +147,20 @@ def poses_from_table(
 
 def _convention(table: TextTable) -> Convention:
     try:
-        return convention_named(table.comments.get("convention", "pi-hexapod"))
+        return convention_named(without_confirmation(table.comments.get("convention", "pi-hexapod")))
     except ConventionError as error:
         raise ConventionError(f"{table.path}: {error}") from error
+
+
+def without_confirmation(text: str) -> str:
+    """NAME of `NAME, confirmed`."""
+    return text.removesuffix(CONFIRMED).rstrip(" ,")
+
+
+def _confirms_convention(table: TextTable) -> bool:
+    """`# convention: NAME, confirmed`, or a named convention in a table whose units the user vouches for."""
+    named = table.comments.get("convention", "")
+    return bool(named) and (named.endswith(CONFIRMED) or table.comments.get("units") == CONFIRMED)
 
 
 def _source(table: TextTable) -> Literal["encoder", "set"]:
@@ -153,7 +173,7 @@ def _source(table: TextTable) -> Literal["encoder", "set"]:
 def _units(table: TextTable, convention: Convention) -> bool:
     """Whether the table confirms its units.  `# units: mm, deg` only repeats the columns and must agree with them."""
     declared = table.comments.get("units")
-    if declared == "confirmed":
+    if declared == CONFIRMED:
         return True
     allowed = {"mm"} | ({convention.unit} - {"none"}) | {"deg"}
     words = set(re.split(r"[\s,;]+", declared.strip())) if declared else {"mm"}
@@ -354,7 +374,7 @@ def write_poses(
             f"q{k + 1}_{unit}": (np.degrees(q) if unit == "deg" else q).tolist()
             for k, (q, unit) in enumerate(zip(poses.q.T, units, strict=True))
         }
-    head = {"convention": c.name, "source": poses.source}
+    head = {"convention": f"{c.name}, {CONFIRMED}" if poses.convention_confirmed else c.name, "source": poses.source}
     if poses.pivot is not None:
         head["pivot_mm"] = ", ".join(repr(float(x)) for x in poses.pivot)
     if _looks_doubtful(poses, c):

@@ -40,6 +40,8 @@ class PoseSequence(Rows):
     orientations: (n, 3 or 4) the orientation columns as they were written, in the convention's unit, or None.  They
                serve to test other readings of them; T_MH holds the poses.
     units_confirmed: the user says that unusual magnitudes are right (`# units: confirmed`).
+    convention_confirmed: the orientations are what they are meant to be, whatever else fits as well: True for poses
+               made in a program, False for a file that does not say so (`# convention: NAME, confirmed`).
     """
 
     T_MH: RigidTransform
@@ -55,6 +57,7 @@ class PoseSequence(Rows):
     q: Array | None = None
     orientations: Array | None = None
     units_confirmed: bool = False
+    convention_confirmed: bool = True
 
     def __post_init__(self) -> None:
         self.T_MH.require(Frame.M, Frame.H)

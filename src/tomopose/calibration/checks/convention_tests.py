@@ -325,6 +325,12 @@ def _fit_alternative(
     return minimise(problem, free, whole, iterations=ITERATIONS) if whole.chi2 < hopeless else whole
 
 
+def optimum_under(problem: Problem, free: FreeParameters) -> Fit:
+    """The optimum of a problem that an alternative made."""
+    held = free_parameters(problem.scanners, fix=tuple(UNITS))
+    return _optimum(problem, ray_equations(problem), free, held, 0, np.inf)
+
+
 def _optimum(
     problem: Problem, rays: Rays, free: FreeParameters, held: FreeParameters, starts: int, enough: float
 ) -> Fit:

@@ -23,19 +23,28 @@ TILES = 4
 FEW_ANGLES, MANY_ANGLES = 3, 12
 """Table angles that must differ before harmonics are asked for; from the second number on two harmonics are."""
 
+AS_NAMED = 0.05
+"""Part of a size that an effect may have by which the estimate may differ: other small effects pull at it."""
+
 Words = Callable[[Array, float, str], str]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """name: fixed;  kind: scanner | panel | manipulator | table | time | step;  short: a few words;  odds: log of its
-    prior odds against the others;  words: (size, px, pose id) -> the sentence."""
+    """name: fixed;  kind: scanner | panel | manipulator | table | time | step | convention;  short: a few words;  odds:
+    log of its prior odds against the others;  sizes: the only ones that it may have (of either sign), or any;  words:
+    (size, px, pose id) -> the sentence."""
 
     name: str
     kind: str
     short: str
     words: Words
     odds: float = 0.0
+    sizes: tuple[float, ...] = ()
+
+    def may_be(self, size: float, sigma: float) -> bool:
+        """Whether a size with that standard uncertainty is one of those that the effect may have."""
+        return not self.sizes or any(abs(abs(size) - s) < max(3.0 * sigma, AS_NAMED * s) for s in self.sizes)
 
     def words_of(self, size: Array, px: float, at: str, *, short: bool = False) -> str:
         return self.short if short else f"{self.words(size, px, at)} ({px:.2g} px rms)"
@@ -43,10 +52,12 @@ class Effect:
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """C (2 n, c): whitened columns of an effect."""
+    """C (2 n, c): whitened columns of an effect;  constant: how many of them, the first, are no part of the effect but
+    must be free beside it."""
 
     effect: Effect
     C: Array
+    constant: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +93,9 @@ SCANNER_WORDS = {
     "translation_scale": ("the manipulator's translations have the scale 1 {:+.3g}", 1.0, "translation scale"),
 }
 
+
+ORIGIN_ODDS = -2.0
+"""Where v_0 does not show, an origin of the pixels and u_0 explain the same: u_0 is named first, the origin beside."""
 
 AXIS_ODDS = -1.0
 """A tilt of the table axis about the beam and a roll of the panel are the same to the images: the panel's is named."""
@@ -144,6 +158,21 @@ def effects_of(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
     if n > 2 * DRIFT_ORDER:
         found += _drifts(problem, b)
     return found
+
+
+def pixel_origin(problem: Problem) -> Columns:
+    """Pixels counted from a corner or from 1: u and v are off alike, by half a pixel or a whole one."""
+    effect = Effect(
+        name="pixel origin",
+        kind="convention",
+        short="pixels counted from another origin (corner, or 1)",
+        words=lambda size, px, at: (
+            f"u and v are both off by {float(size[0]):+.2f} px: pixels are counted from another origin (a corner, or 1)"
+        ),
+        odds=ORIGIN_ODDS,
+        sizes=(0.5, 1.0),
+    )
+    return Columns(effect=effect, C=_white(problem, np.ones((len(problem), 2, 1))))
 
 
 def _panel(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
@@ -283,7 +312,7 @@ def _drifts(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
         ):
             C = (base[:, :, None, :] * course[:, None, : order + 1, None]).reshape(len(problem), 2, -1)
             effect = _length(name if order > 1 else f"{name}, {ending}", "time", short, text, factor, order)
-            found.append(Columns(effect=effect, C=_white(problem, C)))
+            found.append(Columns(effect=effect, C=_white(problem, C), constant=base.shape[2]))
     return found
 
 

@@ -93,10 +93,10 @@ RULES: tuple[Rule, ...] = (
     Rule(
         name="nothing fits",
         condition=f"d_rms above {{limit:g}} of the rms spread of the centres and above {NOTHING_FITS_PX:g} px",
-        limit=0.1,
+        limit=0.05,
         verdict="rejected",
-        reason="less than 99 % of the centres' variance is explained; robots with their nominal geometry leave 0.004 "
-        "to 0.009 (benchmarks/manipulator)",
+        reason="5 % of the spread remain: robots with their nominal geometry leave 0.004 to 0.009 "
+        "(benchmarks/manipulator), wrong readings of robots' tables 0.2 to 0.7",
         measure=measures.nothing_fits,
     ),
     Rule(
@@ -128,6 +128,16 @@ RULES: tuple[Rule, ...] = (
         reason="5 sigma: some 65 alternatives are tried",
         measure=lambda e, limit: measures.alternatives(e, False),
         arrangements=("moving-object", "moving-scanner", "turntable"),
+    ),
+    Rule(
+        name="convention not distinguished",
+        condition="the poses cannot distinguish another reading of the orientation columns, which would put a tilted "
+        "scan off by more than {limit:g} px, and the user has not confirmed the convention",
+        limit=0.25,
+        verdict="doubtful",
+        reason="a quarter of a pixel blurs edges as much as interpolation between voxels does",
+        measure=measures.undistinguished,
+        arrangements=("moving-object",),
     ),
     Rule(
         name="many centres do not fit",
@@ -175,8 +185,8 @@ RULES: tuple[Rule, ...] = (
         "do not explain",
         limit=MISFIT_CHI2,
         verdict="doubtful",
-        reason="residuals twice as large as stated; 0.005 px is half the noise of the best detections, below which "
-        "only rounding is left",
+        reason="residuals twice as large as stated; below 0.001 px, half the noise of the best detections, only "
+        "rounding is left",
         measure=measures.unexplained,
     ),
     Rule(
@@ -257,6 +267,16 @@ RULES: tuple[Rule, ...] = (
         measure=culprits.either_or,
     ),
     Rule(
+        name="origin of the pixels",
+        condition="half a pixel or a whole one in both u and v explains the images as well as u_0 and v_0 do",
+        limit=NONE,
+        verdict="doubtful",
+        reason="one of the two puts the images of a scan off by as much",
+        measure=lambda e, limit: culprits.pixel_origin(e),
+        models=("rigid",),
+        arrangements=ONE_TABLE,
+    ),
+    Rule(
         name="repeated pose",
         condition=f"a repeated pose off by more than {{limit:g}} sigma and {REPEAT_PX:g} px",
         limit=5.0,
@@ -280,6 +300,17 @@ RULES: tuple[Rule, ...] = (
         verdict="doubtful",
         reason="a fit with twice as many equations as unknowns predicts at most 2 times worse than it fits",
         measure=measures.held_out,
+    ),
+    Rule(
+        name="halves of the poses",
+        condition="the calibration from the half of the poses near the focal spot and that from the other half differ "
+        "by more than is stated, with less than {limit:g} of probability by chance",
+        limit=1e-4,
+        verdict="doubtful",
+        reason="a model error shows there when no residual does; one false alarm in 10 000 runs",
+        measure=measures.halves,
+        models=("rigid",),
+        arrangements=ONE_TABLE,
     ),
     Rule(
         name="uncertainty of a tilted scan",

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tomopose.calibration.checks.effects import Columns, Effect, Steps, effects_of, steps_of
+from tomopose.calibration.checks.effects import Columns, Effect, Steps, effects_of, pixel_origin, steps_of
 from tomopose.calibration.model.parameters import FreeParameters, free_parameters
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.rigid.fit import Fit, blocks, jacobian, minimise
@@ -125,6 +125,11 @@ class _Candidate:
     evidence: float
     at: int = -1
     size: float = float("nan")
+    sigma: float = float("nan")
+
+    @property
+    def may_be(self) -> bool:
+        return self.effect.may_be(self.size, self.sigma)
 
 
 def _plain(columns: Sequence[Columns], Q: Array, rest: Array, dof: int, looks: float, n: int) -> list[_Candidate]:
@@ -147,9 +152,16 @@ def _plain(columns: Sequence[Columns], Q: Array, rest: Array, dof: int, looks: f
         if not rank:
             continue
         evidence = float(_evidence(np.array(gain), rank, chi2, dof, n, looks)) + c.effect.odds
+        if c.constant:
+            # a constant belongs to the scanner's values: what varies must show by itself
+            least = slice(part.start, part.start + c.constant)
+            without, r0 = _gain(M[least, least], g[least])
+            varies = float(_evidence(np.array(gain - without), max(rank - r0, 1), chi2 - without, dof, n, looks))
+            evidence = evidence if varies > DECISIVE else min(evidence, varies)
         one = c.C.shape[1] == 1
         size = float(g[part][0] / M[part, part][0, 0] * unit[part][0]) if one else float("nan")
-        found.append(_Candidate(effect=c.effect, columns=c.C, gain=gain, evidence=evidence, size=size))
+        sigma = float(unit[part][0]) if one else float("nan")
+        found.append(_Candidate(effect=c.effect, columns=c.C, gain=gain, evidence=evidence, size=size, sigma=sigma))
     return found
 
 
@@ -252,7 +264,7 @@ def ranked_explanations(
             break
         candidates = _plain(columns, Q, rest, dof, looks, n)
         candidates += [s for s in (_step(one, Q, rest, dof, looks, n) for one in steps) if s is not None]
-        candidates.sort(key=lambda c: -c.evidence)
+        candidates = sorted((c for c in candidates if c.may_be), key=lambda c: -c.evidence)
         if turn == 0:
             single = tuple(
                 Single(name=c.effect.name, short=c.effect.short, kind=c.effect.kind, evidence=c.evidence, size=c.size)
@@ -284,10 +296,13 @@ def _explain(
 ) -> Explanation:
     full = np.zeros((len(rest), c.columns.shape[1]))
     full[: 2 * white.n] = c.columns
+    before = np.linalg.norm(full, axis=0)
     full = full - Q @ (Q.T @ full)
     norm = np.linalg.norm(full, axis=0)
-    size = np.linalg.lstsq(full / np.maximum(norm, 1e-300), rest, rcond=1e-3)[0] / np.maximum(norm, 1e-300)
-    moved = np.linalg.solve(problem.W, (c.columns @ size).reshape(-1, 2, 1))[..., 0]
+    # a column that the fit takes up whole has no size of its own
+    unit = np.where(norm > SEEN * before, 1.0 / np.maximum(norm, 1e-300), 0.0)
+    size = np.linalg.lstsq(full * unit, rest, rcond=1e-3)[0] * unit
+    moved = np.linalg.solve(problem.W, (full[: 2 * white.n] @ size).reshape(-1, 2, 1))[..., 0]
     px = float(np.sqrt((moved**2).sum(axis=1).mean()))
     at = "" if c.at < 0 else problem.pose_id[c.at]
     also = tuple(
@@ -349,8 +364,16 @@ class ScannerTests:
             return ()
         equal = [s for s in self.declared.single if s.evidence > best - EQUAL]
         likely = [s for s in equal if abs(s.size) <= PLAUSIBLE * self.sigma.get(s.name, 0.0)]
-        others = [s for s in equal if s.kind != "scanner" and s.evidence > self.gain - EQUAL]
+        others = [s for s in equal if s.kind not in ("scanner", "convention") and s.evidence > self.gain - EQUAL]
         return () if likely else tuple(others)
+
+    @property
+    def pixel_origin(self) -> Single | None:
+        """Another origin of the pixels, where it explains why the declared values do not fit as well as they do."""
+        best = self.declared.single[0].evidence if self.declared.single else 0.0
+        found = [s for s in self.declared.single if s.kind == "convention"]
+        least = max(DECISIVE, best - EQUAL, self.gain - EQUAL)
+        return found[0] if found and found[0].evidence > least else None
 
     @property
     def left(self) -> tuple[Explanation, ...]:
@@ -359,8 +382,10 @@ class ScannerTests:
 
     @property
     def explanations(self) -> tuple[Explanation, ...]:
-        """The culprit first: what explains best why the declared values do not fit, then what is left."""
-        first = self.declared.chosen[:1]
+        """The culprit first: what explains best why the declared values do not fit, then what is left.
+
+        Where all scanner values together explain more, several are off, and no single one is the culprit."""
+        first = tuple(e for e in self.declared.chosen[:1] if e.evidence > self.gain - EQUAL)
         return (*first, *(e for e in self.beside.chosen if e.name not in {f.name for f in first}))
 
 
@@ -405,7 +430,8 @@ def scanner_tests(problem: Problem, free: FreeParameters, fit: Fit) -> ScannerTe
     if not len(free) or not np.isfinite(plain.chi2):
         return ScannerTests(beside=beside, declared=beside, gain=0.0)
     before = whitened(problem, held, plain)
-    declared = ranked_explanations(problem, before, [*effects_of(problem, blocks(problem, held, plain))], steps, most=1)
+    effects = [*effects_of(problem, blocks(problem, held, plain)), pixel_origin(problem)]
+    declared = ranked_explanations(problem, before, effects, steps, most=1)
     known = np.isfinite(free.sigma)
     C = (problem.W @ (b.J_scanner[:, :, free.cols] * free.factor)).reshape(2 * len(problem), -1)[:, known]
     together = evidence_together(beside, declared, before, C * free.sigma[known])

@@ -254,6 +254,8 @@ def _unseen(fit: ModelFit, linear: LinearFit) -> Unseen | None:
         origin=problem.data.t_MH,
         alpha=problem.data.alpha,
         moving_scanner=problem.inverse,
+        # identified errors of a machine hold the scale that its parts state
+        scale_known=len(e.state.p) > 0,
     )
 
 

@@ -54,11 +54,13 @@ DEFAULTS: Mapping[str, Default] = MappingProxyType(
 ROTATION_SCALE = 2e-5
 """Scale error of a platform's rotations: that of linear encoders with the geometry of the joints."""
 
-TRANSLATION_SCALE = 5e-6
-"""Scale error of the translations, 5 um a metre: a glass scale of good grade.  No image shows it: the translations are
-the only lengths that a calibration by one ball knows."""
+TRANSLATION_SCALE, ROBOT_TRANSLATION_SCALE = 3e-6, 1e-3
+"""Scale error of the translations of a platform: a glass scale of the grade +-5 um a metre, 5 / sqrt(3); of a robot:
+a millimetre a metre, as arms whose links nobody calibrated reach (Mooring, Roth and Driels, Fundamentals of
+Manipulator Calibration, 1991).  No image shows it: the translations are the only lengths that a calibration by one ball
+knows.  A prior of `translation_scale` states another, and fixing it says that it is exact."""
 
-WOBBLE_MM, WOBBLE_RAD = 5e-5, 0.25e-6
+WOBBLE_MM, WOBBLE_RAD = 3e-5, 0.25e-6
 """Radial, axial and tilt error motion of a rotary table with an air bearing, first harmonic."""
 
 Source: TypeAlias = Literal["scanner.json", "default", "exact", "option"]

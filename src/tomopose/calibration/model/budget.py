@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tomopose.calibration.model.assumed import Assumed
+from tomopose.units import Array
 
 NAMED, MOST_NAMED = 0.05, 3
 """Share of the variance from which an assumed value is named, and how many are."""
@@ -29,6 +30,22 @@ class ScanBudget:
     tilted: bool = True
 
 
+@dataclass(frozen=True, kw_only=True)
+class Halves:
+    """How the calibrations from two disjoint halves of the poses differ over the field of view of a scan.
+
+    x_D (k, 2) px: where points are imaged;  difference (k, 2) px, the object's rigid pose removed;  sigma (k, 2) px:
+    its standard uncertainty;  rms_px, stated_px: of both;  p: probability of so much by chance.
+    """
+
+    x_D: Array
+    difference: Array
+    sigma: Array
+    rms_px: float
+    stated_px: float
+    p: float
+
+
 def budget_words(budget: ScanBudget, assumed: tuple[Assumed, ...]) -> str:
     """The sentence of the first screen, such as "0.12 px, of which 0.116 px from d_SR (no sigma given; 0.05 mm
     assumed). Two table angles would make it 0.001 px."."""
@@ -41,7 +58,7 @@ def budget_words(budget: ScanBudget, assumed: tuple[Assumed, ...]) -> str:
             break
         a = known.get(name)
         if a is None:
-            parts.append(f"{px:.2g} px from {name}, which no ball shows")
+            parts.append(f"{px:.2g} px from {name} (no sigma given), which no ball shows")
             continue
         said = "no sigma given; " if a.source == "default" else ""
         value = f"{1000 * a.sigma:.3g} mrad" if a.unit == "rad" else f"{a.sigma:.3g} {a.unit}"

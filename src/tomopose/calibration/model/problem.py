@@ -45,6 +45,7 @@ class Problem:
     not_seen: ids of poses whose ball was not measured, with the reason.
     orientations (n, 3 or 4): the orientation columns as written, in the convention's unit, or None.
     units_confirmed: the user says that unusual magnitudes of the poses are right.
+    convention_confirmed: the user says that the orientation columns are in the declared convention.
     outline (n,): product of the semi axes of the silhouettes, px^2, NaN where unknown;  ball_diameter: mm; or None.
     """
 
@@ -66,6 +67,7 @@ class Problem:
     convention: str = "pi-hexapod"
     orientations: Array | None = None
     units_confirmed: bool = False
+    convention_confirmed: bool = True
     outline: Array | None = None
     ball_diameter: float | None = None
 
@@ -251,6 +253,7 @@ def pair(
         convention=runs_p[0].convention,
         orientations=_written_orientations(runs_p, parts["index"]),
         units_confirmed=all(p.units_confirmed for p in runs_p),
+        convention_confirmed=all(p.convention_confirmed for p in runs_p),
         outline=np.concatenate(parts["outline"]),
         ball_diameter=_one_diameter(runs_o),
     )

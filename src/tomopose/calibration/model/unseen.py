@@ -13,7 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tomopose.calibration.model.assumed import ROTATION_SCALE, TRANSLATION_SCALE, WOBBLE_MM, WOBBLE_RAD
+from tomopose.calibration.model.assumed import (
+    ROBOT_TRANSLATION_SCALE,
+    ROTATION_SCALE,
+    TRANSLATION_SCALE,
+    WOBBLE_MM,
+    WOBBLE_RAD,
+)
 from tomopose.calibration.model.ball_projection import ProjectionBlocks
 from tomopose.geometry.rotations import R_z, log_rotation, skew
 from tomopose.geometry.transforms import RigidTransform
@@ -41,12 +47,12 @@ class Unseen:
     gain: Array
 
 
-def unseen_sigma(names: tuple[str, ...]) -> Array:
+def unseen_sigma(names: tuple[str, ...], *, robot: bool) -> Array:
     """Prior standard deviations; the second harmonic of a wobble is half the first."""
     values = []
     for name in names:
         size = (
-            TRANSLATION_SCALE
+            (ROBOT_TRANSLATION_SCALE if robot else TRANSLATION_SCALE)
             if name == TRANSLATIONS
             else ROTATION_SCALE
             if name in ROTATIONS
@@ -63,10 +69,19 @@ def unseen_unit(name: str) -> str:
     return "" if name in ROTATIONS or name == TRANSLATIONS else "rad" if name.startswith("table_tilt") else "mm"
 
 
-def unseen_names(R_MH: Array, *, table: bool) -> tuple[str, ...]:
-    """Those that apply to a manipulator with poses R_MH (n, 3, 3), and to a set-up with or without a table."""
-    turned = np.linalg.norm(log_rotation(R_MH[0].T @ R_MH), axis=1).max()
-    return (TRANSLATIONS, *(ROTATIONS if 0.0 < turned < PLATFORM_RAD else ()), *(WOBBLES if table else ()))
+def largest_turn(R_MH: Array) -> float:
+    """rad: the largest turn from the first of poses R_MH (n, 3, 3)."""
+    return float(np.linalg.norm(log_rotation(R_MH[0].T @ R_MH), axis=1).max())
+
+
+def unseen_names(turned: float, *, table: bool, translations: bool = True) -> tuple[str, ...]:
+    """Those that apply to a manipulator that turns by up to `turned` rad, to a set-up with or without a table, where
+    the scale of the translations is known or not."""
+    return (
+        *((TRANSLATIONS,) if translations else ()),
+        *(ROTATIONS if 0.0 < turned < PLATFORM_RAD else ()),
+        *(WOBBLES if table else ()),
+    )
 
 
 def turns(R: Array) -> Array:
@@ -111,12 +126,12 @@ def unseen_columns(
     return np.stack(columns, axis=2) if columns else np.zeros((*b.x_D.shape, 0))
 
 
-def unseen_gain(names: tuple[str, ...], covariance: Array, J: Array, V: Array, C: Array) -> Unseen:
+def unseen_gain(names: tuple[str, ...], sigma: Array, covariance: Array, J: Array, V: Array, C: Array) -> Unseen:
     """K from the estimate's covariance (m, m), Jacobian J (n, 2, m), covariances V (n, 2, 2) of the centres and columns
-    C (n, 2, c)."""
+    C (n, 2, c); sigma (c,): priors."""
     weighted = np.linalg.solve(V, C)
     gain = covariance @ np.einsum("nim,nic->mc", J, weighted)
-    return Unseen(names=names, sigma=unseen_sigma(names), gain=gain)
+    return Unseen(names=names, sigma=sigma, gain=gain)
 
 
 def unseen_of(
@@ -129,11 +144,14 @@ def unseen_of(
     origin: Array,
     alpha: Array,
     moving_scanner: bool,
+    scale_known: bool = False,
 ) -> Unseen:
     """What no ball shows of table and manipulator, and how the estimate of any model answers to it.
 
-    b: of the rows used;  covariance (m, m), J (n, 2, m), V (n, 2, 2): of the fit;  the others as of `unseen_columns`.
+    b: of the rows used;  covariance (m, m), J (n, 2, m), V (n, 2, 2): of the fit;  scale_known: the scale of the
+    translations is among the parameters or exact;  the others as of `unseen_columns`.
     """
-    names = unseen_names(b.R_MH, table=not moving_scanner)
+    turned = largest_turn(b.R_MH)
+    names = unseen_names(turned, table=not moving_scanner, translations=not scale_known)
     C = unseen_columns(names, b, T_HT=T_HT, origin=origin, alpha=alpha, about_H=moving_scanner)
-    return unseen_gain(names, covariance, J, V, C)
+    return unseen_gain(names, unseen_sigma(names, robot=turned > PLATFORM_RAD), covariance, J, V, C)

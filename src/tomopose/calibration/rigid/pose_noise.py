@@ -8,7 +8,7 @@ have the restricted likelihood (Patterson and Thompson, Biometrika 58 (1971) 545
     -2 log L = sum log det V_k + log det N + r^T V^-1 r + d^T P^-1 d - g^T N^-1 g,
     N = J^T V^-1 J + P^-1,    g = J^T V^-1 r - P^-1 d.
 
-The prior of s_t and s_w is 1 / ((0.2 + s / s_maker) (1 + (s / s_maker)^2)^2): a machine may be better than its data
+The prior of s_t and s_w is 1 / ((0.1 + s / s_maker) (1 + (s / s_maker)^2)^2): a machine may be better than its data
 sheet, and the tail lets the data overrule it.  What is stated is the root of the posterior mean of s^2: scatter that
 the residuals leave room for counts, whether it is significant or not.  Backlash and periodic errors of drives, which
 one ball cannot distinguish from scatter, are within it.
@@ -36,6 +36,10 @@ STEPS = 8
 """Values of each scatter that the posterior is summed over, from 0 on; flat from 7 to 16 within 3 % of the result
 (benchmarks/reality)."""
 
+
+BEST_MACHINE = 0.1
+"""Part of the maker's repeatability down to which every size of the scatter is alike likely: makers state limits.  With
+0.2 clean runs state a tenth more, with 0.05 a scatter of 12 urad is stated as 7 (benchmarks/reality)."""
 
 WIDE = 8.0
 """Times the scatter that equals detection noise: beyond it the grid is laid about the likeliest value."""
@@ -172,7 +176,7 @@ def estimate_pose_noise(
 
 def scatter_prior(q: Array) -> Array:
     """Prior density of a scatter, in units of the maker's; see the module."""
-    return np.asarray(1.0 / ((0.2 + q) * (1.0 + q**2) ** 2))
+    return np.asarray(1.0 / ((BEST_MACHINE + q) * (1.0 + q**2) ** 2))
 
 
 def expected_scatter(maker: Repeatability | None = None) -> PoseNoise:

@@ -7,6 +7,8 @@ sees: a rigid motion of the whole object is taken out.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
@@ -14,13 +16,13 @@ from tomopose.calibration.model.budget import ScanBudget
 from tomopose.calibration.model.covariance import inverse_information
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.model.unseen import PLATFORM_RAD, ROTATIONS, TRANSLATIONS
+from tomopose.calibration.model.unseen import PLATFORM_RAD, ROTATIONS, TRANSLATIONS, largest_turn
 from tomopose.calibration.result import Calibration
 from tomopose.calibration.uncertainty.propagation import field_of_view_points
 from tomopose.calibration.uncertainty.trajectory import scan_jacobian
 from tomopose.errors import OutOfReachError, TrajectoryError
 from tomopose.geometry.frames import Frame
-from tomopose.geometry.rotations import exp_rotation, log_rotation
+from tomopose.geometry.rotations import exp_rotation
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.error_models import RigidErrors, TwinErrors
 from tomopose.manipulator.poses import PoseSequence
@@ -32,8 +34,7 @@ VIEWS = 12
 
 def reference_scan(poses: PoseSequence, *, tilt: float = TILT) -> PoseSequence:
     """The scan for which the first screen states an uncertainty; tilt: rad, 0 for a table that turns alone."""
-    R = poses.T_MH.R
-    if np.linalg.norm(log_rotation(R[0].T @ R), axis=1).max() > PLATFORM_RAD:
+    if largest_turn(poses.T_MH.R) > PLATFORM_RAD:
         return poses.select(np.unique(np.linspace(0, len(poses) - 1, 2 * VIEWS).round().astype(int)))
     alpha = np.linspace(0.0, 2 * np.pi, VIEWS, endpoint=False)
     w = tilt * np.column_stack([np.sin(2 * alpha), np.cos(2 * alpha + 0.5), np.zeros(VIEWS)])
@@ -69,9 +70,18 @@ def shares_of(
     return total, measured, sorted(parts, key=lambda p: -p[1])
 
 
-def scan_budget(calibration: Calibration, problem: Problem, linear: LinearFit) -> ScanBudget | None:
-    """The budget of a calibration; None for twin robots, whose scans have two tables, and where no such scan is
-    within reach."""
+@dataclass(frozen=True, kw_only=True)
+class ReferenceScan:
+    """x_D (k, 2) px: where points of the field of view are imaged;  J (k, 2, c) px: how they answer to what was
+    estimated and to what no ball shows, the object's rigid pose removed;  C (c, c): covariance of both."""
+
+    x_D: Array
+    J: Array
+    C: Array
+
+
+def reference_of(calibration: Calibration, problem: Problem) -> ReferenceScan | None:
+    """The scan; None for twin robots, whose scans have two tables, and where no such scan is within reach."""
     if isinstance(calibration.errors, TwinErrors):
         return None
     own = PoseSequence(
@@ -88,7 +98,20 @@ def scan_budget(calibration: Calibration, problem: Problem, linear: LinearFit) -
         J, C = scan_jacobian(calibration, scan, x_M)
     except (TrajectoryError, OutOfReachError):
         return None
-    flat = J.reshape(-1, J.shape[-1])
+    pose = np.repeat(np.arange(len(scan)), len(x_M))
+    b = projection_blocks(
+        scanner, T_HT=calibration.T_HT, T_MH=scan.T_MH[pose], t=np.tile(x_M, (len(scan), 1)), alpha=scan.alpha[pose]
+    )
+    return ReferenceScan(x_D=b.x_D, J=J.reshape(len(pose), 2, -1), C=C)
+
+
+def scan_budget(
+    calibration: Calibration, problem: Problem, linear: LinearFit, scan: ReferenceScan | None
+) -> ScanBudget | None:
+    """The budget of a calibration; None where there is no scan of reference."""
+    if scan is None:
+        return None
+    flat = scan.J.reshape(-1, scan.J.shape[-1])
     names = [*calibration.tangent, *(calibration.unseen.names if calibration.unseen else ())]
     columns: dict[str, list[int]] = {}
     held = {a.name for a in calibration.assumed if a.sigma > 0}
@@ -98,13 +121,13 @@ def scan_budget(calibration: Calibration, problem: Problem, linear: LinearFit) -
             columns.setdefault(base, []).append(j)
         elif j >= len(calibration.tangent):
             columns.setdefault(_group(name), []).append(j)
-    total, measured, shares = shares_of(flat, C, columns)
+    total, measured, shares = shares_of(flat, scan.C, columns)
     return ScanBudget(
         total=total,
         measured=measured,
         shares=tuple(shares),
         two_angles=_with_two_angles(calibration, problem, linear, flat, total),
-        tilted=tilted,
+        tilted=calibration.arrangement != "turntable",
     )
 
 

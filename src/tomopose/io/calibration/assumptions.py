@@ -9,7 +9,7 @@ import numpy as np
 
 from tomopose.calibration.checks.scanner_tests import Explanation
 from tomopose.calibration.model.assumed import Assumed
-from tomopose.calibration.model.budget import ScanBudget, budget_words
+from tomopose.calibration.model.budget import Halves, ScanBudget, budget_words
 from tomopose.calibration.model.unseen import Unseen, unseen_unit
 from tomopose.calibration.result import Calibration
 from tomopose.calibration.rigid.contradiction import Contradicted
@@ -18,7 +18,7 @@ from tomopose.io.numbers_json import decode_array, encode
 
 
 def document(cal: Calibration) -> dict[str, Any]:
-    """The keys assumed, unseen, explanations, contradicted and scan_uncertainty."""
+    """The keys assumed, unseen, explanations, contradicted, scan_uncertainty and halves."""
     unseen = cal.unseen
     stated = [{"name": a.name, "sigma": encode(a.sigma), "unit": a.unit, "from": a.source} for a in cal.assumed]
     if unseen is not None:
@@ -34,7 +34,34 @@ def document(cal: Calibration) -> dict[str, Any]:
         "explanations": [e.to_json() for e in cal.explanations],
         "contradicted": [{"name": c.name, "stated": encode(c.stated), "off": encode(c.off)} for c in cal.contradicted],
         "scan_uncertainty": None if cal.budget is None else _budget(cal.budget, cal),
+        "halves": None if cal.halves is None else _halves(cal.halves),
     }
+
+
+def _halves(h: Halves) -> dict[str, Any]:
+    return {
+        "rms_px": encode(h.rms_px),
+        "stated_px": encode(h.stated_px),
+        "p": encode(h.p),
+        "x_D_px": encode(h.x_D),
+        "difference_px": encode(h.difference),
+        "sigma_px": encode(h.sigma),
+    }
+
+
+def _halves_from(document: Mapping[str, Any] | None) -> Halves | None:
+    if document is None:
+        return None
+    k = len(document["x_D_px"])
+    x_D, difference, sigma = (decode_array(document[name], k, 2) for name in ("x_D_px", "difference_px", "sigma_px"))
+    return Halves(
+        x_D=x_D,
+        difference=difference,
+        sigma=sigma,
+        rms_px=number(document["rms_px"]),
+        stated_px=number(document["stated_px"]),
+        p=number(document["p"]),
+    )
 
 
 def _budget(b: ScanBudget, cal: Calibration) -> dict[str, Any]:
@@ -91,6 +118,7 @@ def from_document(document: Mapping[str, Any], m: int) -> dict[str, Any]:
             Contradicted(name=c["name"], stated=number(c["stated"]), off=number(c["off"]))
             for c in document.get("contradicted", ())
         ),
+        "halves": _halves_from(document.get("halves")),
         "budget": None
         if budget is None
         else ScanBudget(

@@ -36,7 +36,8 @@ def read(file: ForeignFile, options: PoseOptions) -> PoseLog:
     cells = read_cells(file)
     columns = roles.columns_of(cells.headers, cells.units_row)
     notes: list[str] = []
-    convention = roles.named_convention(options.convention or cells.comments.get("convention"))
+    stated = cells.comments.get("convention", "").removesuffix("confirmed").rstrip(" ,")
+    convention = roles.named_convention(options.convention or stated or None)
     if convention is None:
         convention, note = roles.convention_of(columns, file.path)
         notes.append(note)

@@ -10,6 +10,7 @@ import numpy as np
 from tomopose.calibration.checks.stability import Stability
 from tomopose.calibration.result import Calibration, ModelComparison, RotationResiduals
 from tomopose.geometry.scanner import PARAMETER_UNITS
+from tomopose.report.figures.halves_figure import halves_map
 from tomopose.report.page import Block, Figure, Section, Table, Words
 from tomopose.report.style import ACCENT, ORANGE, SOFT, axis, layout
 from tomopose.report.words import cell, number
@@ -45,6 +46,8 @@ def checks_section(calibration: Calibration) -> Section | None:
             blocks.append(models_by_rotation(compared.by_rotation))
     if calibration.stability is not None:
         blocks += _stability(calibration.stability)
+    if calibration.halves is not None:
+        blocks.append(halves_map(calibration.halves))
     words = list(_noise_words(calibration))
     if words:
         blocks.append(Words(title="Noise", items=words))

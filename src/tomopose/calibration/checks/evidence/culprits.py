@@ -28,6 +28,22 @@ def contradicted(e: Evidence, limit: float) -> Iterator[Found]:
         )
 
 
+def pixel_origin(e: Evidence) -> Iterator[Found]:
+    """u and v off alike by half a pixel or one: nothing in the images distinguishes it from u_0 and v_0."""
+    found = e.tests.pixel_origin if e.tests else None
+    if found is not None:
+        shift = 0.5 if abs(found.size) < 0.75 else 1.0
+        low = found.size > 0
+        origin = "half a pixel " + ("low" if low else "high") if shift == 0.5 else "pixels counted from 1"
+        yield Found(
+            value=found.size,
+            words=f"u_0 and v_0 off by {found.size:+.2f} px explain the images, and so does an alternative convention "
+            f"({origin}): then the pixels of observations.csv are counted from another origin than those of a scan",
+            remedy=f"observations.csv: {'subtract' if low else 'add'} {shift:g} px {'from' if low else 'to'} u_px and "
+            "v_px, if (0, 0) is not the centre of a pixel there; else correct u_0 and v_0 in scanner.json",
+        )
+
+
 def either_or(e: Evidence, limit: float) -> Iterator[Found]:
     """Another cause explains the images as well as the scanner's values, with another scan as the consequence."""
     rivals = e.tests.rivals if e.tests else ()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from tomopose.calibration.checks.convention_tests import Diagnosis
 from tomopose.calibration.checks.scanner_tests import ScannerTests
 from tomopose.calibration.checks.stability import Stability
+from tomopose.calibration.model.budget import Halves
 from tomopose.calibration.rigid.contradiction import Contradicted
 
 MISFIT_CHI2 = 4.0
@@ -54,6 +55,17 @@ class BallSize:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Undistinguished:
+    """A reading that the poses cannot distinguish.  name, words, remedy: of the alternative;  px: rms of a coordinate
+    by which a scan would be off, were it right."""
+
+    name: str
+    words: str
+    remedy: str
+    px: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Evidence:
     """What the rules look at.  None: does not apply to this model or arrangement, or was not looked at.
 
@@ -70,6 +82,8 @@ class Evidence:
     prior_pulls:  (name, deviation from its stated value in prior standard deviations) of each freed parameter.
     tests:        one effect after the other, beside everything that was assumed; in place of stability's effects.
     contradicted: scanner values that were freed because the images contradict what was assumed of them.
+    undistinguished: readings of the orientation columns that these poses cannot distinguish from the declared one.
+    halves:       how calibrations from two halves of the poses differ.
     open_turns:   the sentence on turns of the plate that no data determine; "" where they are determined.
     """
 
@@ -99,6 +113,8 @@ class Evidence:
     prior_pulls: tuple[tuple[str, float], ...] = ()
     tests: ScannerTests | None = None
     contradicted: tuple[Contradicted, ...] = ()
+    undistinguished: tuple[Undistinguished, ...] = ()
+    halves: Halves | None = None
 
     @property
     def n(self) -> int:

@@ -12,7 +12,7 @@ from tomopose.calibration.checks.convention_tests import BETTER, MUCH_BETTER, ot
 from tomopose.calibration.checks.evidence.evidence import MISFIT_CHI2, Evidence
 from tomopose.calibration.checks.stability import Effect
 
-MISFIT_PX = 0.005
+MISFIT_PX = 0.001
 NOTHING_FITS_PX = 3.0
 REPEAT_PX, EFFECT_PX = 0.05, 0.02
 EFFECT_SHARE = 0.25
@@ -83,6 +83,21 @@ def alternatives(e: Evidence, much: bool) -> Iterator[Found]:
                 f"limit {-BETTER:g}; d_rms {h.d_rms:.3g} px instead of {e.residual_px:.3g} px); to try: {h.remedy}",
                 remedy=h.remedy,
             )
+
+
+def undistinguished(e: Evidence, limit: float) -> Iterator[Found]:
+    """Readings that would ruin a scan: by more than the limit, px."""
+    ruinous = [u for u in e.undistinguished if _above(u.px, limit)]
+    if ruinous:
+        worst = ruinous[0]
+        more = f" (and {len(ruinous) - 1} more)" if len(ruinous) > 1 else ""
+        yield Found(
+            value=worst.px,
+            words=f"these poses cannot distinguish the convention of the orientation columns: if {worst.words}{more}, "
+            f"a scan that turns about two axes is off by {worst.px:.2g} px",
+            remedy="add poses that turn about several axes at once, or confirm the convention (--confirm-convention, "
+            "or '# convention: NAME, confirmed' in poses.csv)",
+        )
 
 
 def other_unit(e: Evidence, limit: float) -> Iterator[Found]:
@@ -223,6 +238,17 @@ def held_out(e: Evidence, limit: float) -> Iterator[Found]:
             value=s.held_out_rms / s.fit_rms,
             words=f"held-out poses are predicted to {s.held_out_rms:.3g} px, fitted ones to {s.fit_rms:.3g} px: the "
             "model does not carry over",
+        )
+
+
+def halves(e: Evidence, limit: float) -> Iterator[Found]:
+    h = e.halves
+    if h is not None and h.p < limit:
+        yield Found(
+            value=h.p,
+            words=f"calibrations from two halves of the poses differ by {h.rms_px:.2g} px over the field of view, "
+            f"where {h.stated_px:.2g} px is stated (p = {h.p:.1g}): the model does not hold everywhere",
+            remedy="look at the map of the difference in the report; free or state what is uncertain of the scanner",
         )
 
 
