@@ -274,7 +274,7 @@ RULES: tuple[Rule, ...] = (
         reason="one of the two puts the images of a scan off by as much",
         measure=lambda e, limit: culprits.pixel_origin(e),
         models=("rigid",),
-        arrangements=ONE_TABLE,
+        arrangements=("moving-object", "moving-scanner"),
     ),
     Rule(
         name="repeated pose",
@@ -310,7 +310,7 @@ RULES: tuple[Rule, ...] = (
         reason="a model error shows there when no residual does; one false alarm in 10 000 runs",
         measure=measures.halves,
         models=("rigid",),
-        arrangements=ONE_TABLE,
+        arrangements=("moving-object", "moving-scanner"),
     ),
     Rule(
         name="uncertainty of a tilted scan",

@@ -26,10 +26,13 @@ SEEN = 1e-9
 
 
 def near_and_far(linear: LinearFit) -> tuple[Array, Array]:
-    """Rows of the half of the poses with the larger magnification, and of the others."""
-    order = np.argsort(-np.linalg.norm(linear.J_t_HT, axis=(1, 2)), kind="stable")
-    middle = len(order) // 2
-    return np.sort(order[:middle]), np.sort(order[middle:])
+    """Rows of the half of each ball's poses with the larger magnification, and of the others."""
+    size, ball = np.linalg.norm(linear.J_t_HT, axis=(1, 2)), linear.problem.ball
+    near = np.zeros(len(size), dtype=bool)
+    for k in np.unique(ball):
+        own = np.flatnonzero(ball == k)
+        near[own[np.argsort(-size[own], kind="stable")[: len(own) // 2]]] = True
+    return np.flatnonzero(near), np.flatnonzero(~near)
 
 
 def halves_of(linear: LinearFit, J: Array, x_D: Array, *, widening: float) -> Halves | None:
@@ -46,6 +49,8 @@ def halves_of(linear: LinearFit, J: Array, x_D: Array, *, widening: float) -> Ha
         if len(A) < m - len(linear.prior_rows) + FEWEST:
             return None
         F = A.T @ A
+        if not (np.diag(F + P) > 0).all():
+            return None
         inverse = inverse_information(F + P)
         shift += sign * (inverse @ (A.T @ r + pull))
         spread += inverse @ F @ inverse
@@ -65,9 +70,13 @@ def halves_of(linear: LinearFit, J: Array, x_D: Array, *, widening: float) -> Ha
 
 
 def _chance(shift: Array, C: Array) -> float:
-    """Probability that normal errors with the covariance C are as far from zero as `shift`."""
+    """Probability that normal errors with the covariance C are as far from zero as `shift`; NaN where C is not
+    finite."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(C), 1e-300))
-    value, V = np.linalg.eigh(C * scale[:, None] * scale)
+    scaled = C * scale[:, None] * scale
+    if not np.isfinite(scaled).all():
+        return float("nan")
+    value, V = np.linalg.eigh(scaled)
     seen = value > SEEN * value[-1]
     z = V.T @ (scale * shift)
     return float(chdtrc(int(seen.sum()), float((z[seen] ** 2 / value[seen]).sum())))
