@@ -46,6 +46,9 @@ from tomopose.provenance import provenance
 from tomopose.units import Array
 from tomopose.values import require_types
 
+CONVENTION_RULE = "convention not distinguished"
+"""Found by poses that are trusted, and true of every model."""
+
 MODELS = ("auto", "rigid", "kinematic", "slack")
 
 
@@ -261,7 +264,7 @@ def calibrate(
         return rigid
     from tomopose.calibration.identified.calibrate import calibrate_kinematic
 
-    return calibrate_kinematic(
+    found = calibrate_kinematic(
         scanner,
         poses,
         observations,
@@ -273,6 +276,9 @@ def calibrate(
         distances=distances,
         robust=robust,
     )
+    # identified errors do not settle how the orientation columns are read
+    doubts = tuple(f for f in rigid.checks if f.rule == CONVENTION_RULE)
+    return replace(found, checks=(*found.checks, *doubts)) if doubts else found
 
 
 def _require_model(model: str, *, has_geometry: bool, distances: bool) -> None:
