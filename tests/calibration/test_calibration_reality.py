@@ -211,3 +211,73 @@ def test_what_was_assumed_survives_the_file(tmp_path):
     document = json.loads((tmp_path / "calibration.json").read_text(encoding="utf-8"))
     assert {"name", "sigma", "unit", "from"} <= set(document["assumed"][0])
     assert BALL.shape == (3,)
+
+
+def robot_poses(n=60):
+    """A robot that turns the object far about its own axis, the table at rest."""
+    rng = np.random.default_rng(8)
+    turns = np.column_stack([rng.uniform(-15, 15, (n, 2)), rng.uniform(-150, 150, n)])
+    return tp.PoseSequence.from_table(rng.uniform(-15, 15, (n, 3)), turns)
+
+
+def test_the_scale_of_a_robot_is_in_every_sigma_unless_it_is_stated():
+    """One ball shows no scale of the translations; a scan made with them is too large by as much."""
+    poses = robot_poses()
+    seen = observe(poses)
+    silent, exact = (tp.calibrate(SCANNER, poses, seen, fix=fix) for fix in ((), ("translation_scale",)))
+    stated = tp.calibrate(SCANNER, poses, seen, priors={"translation_scale": 1e-5})
+    assert dict(zip(silent.unseen.names, silent.unseen.sigma, strict=True))["scale_of_translations"] == 1e-3
+    assert "scale_of_translations" not in exact.unseen.names
+    assert silent.budget.shares[0][0] == "the scale of the translations"
+    assert silent.budget.total > 10 * exact.budget.total
+    assert exact.budget.total < stated.budget.total < 0.2 * silent.budget.total
+    u = {n: {p.name: p.u for p in c.parameters} for n, c in (("silent", silent), ("exact", exact))}
+    assert u["silent"]["t_x"] > 2 * u["exact"]["t_x"]
+
+
+def test_halves_of_the_poses_differ_by_what_is_stated_and_by_more_where_the_model_is_wrong():
+    poses = mixed_poses(n=120)
+    clean = [tp.calibrate(SILENT, poses, observe(poses, seed=k), hypotheses=False).halves for k in range(6)]
+    assert 0.3 < np.mean([h.rms_px for h in clean]) / np.mean([h.stated_px for h in clean]) < 2.0
+    assert min(h.p for h in clean) > 1e-4
+    skew = np.eye(3) + 1e-3 * np.array([[0, 1, -1], [0, 0, 1], [0, 0, 0]])
+    moved = replace(poses, T_MH=replace(poses.T_MH, t=poses.T_MH.t @ skew.T))
+    wrong = tp.calibrate(SILENT, poses, observe(moved), hypotheses=False)
+    assert wrong.halves.p < 1e-8
+    assert any(f.rule == "halves of the poses" and f.verdict == "doubtful" for f in wrong.checks)
+
+
+def test_halves_survive_the_file(tmp_path):
+    poses = mixed_poses(n=40)
+    cal = tp.calibrate(SCANNER, poses, observe(poses), hypotheses=False)
+    tp.write_calibration(tmp_path / "c.json", cal)
+    again = tp.read_calibration(tmp_path / "c.json").halves
+    assert (again.rms_px, again.stated_px, again.p) == (cal.halves.rms_px, cal.halves.stated_px, cal.halves.p)
+    np.testing.assert_array_equal(again.difference, cal.halves.difference)
+
+
+def test_a_drift_is_not_named_where_a_constant_explains_the_images():
+    """u_0 and v_0 off: the constant of a drift would explain them both, and what varies is nothing."""
+    poses = mixed_poses(n=80)
+    axis = {f"axis_{name}": 0.0 for name in ("y", "tilt_x", "tilt_y")}
+    off = replace(SCANNER, u_0=SCANNER.u_0 + 0.8, v_0=SCANNER.v_0 - 0.3)
+    cal = tp.calibrate(replace(SILENT, sigma=axis), poses, observe(poses, scanner=off))
+    assert not any("drift" in e.name for e in cal.explanations)
+    assert cal.verdict == "trustworthy"
+
+
+def test_every_finding_is_in_the_answer_of_a_quiet_command(tmp_path, capsys):
+    """Sigmas ten times too large give no doubt, but a word, which --quiet must not swallow."""
+    from tomopose.cli.main import run
+
+    poses = mixed_poses(n=60)
+    tp.write_scanner(tmp_path / "scanner.json", SCANNER.exact())
+    tp.write_poses(tmp_path / "poses.csv", poses)
+    seen = observe(poses)
+    tp.write_observations(tmp_path / "o.csv", tp.BallObservations.from_sigma(seen.x_D, 0.146, pose_id=poses.pose_id))
+    words = ["calibrate", "--scanner", "scanner.json", "--poses", "poses.csv", "--observations", "o.csv"]
+    words = [str(tmp_path / w) if w.endswith((".json", ".csv")) else w for w in words]
+    assert run([*words, "--out", str(tmp_path / "cal"), "--quiet", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert [f["rule"] for f in said["findings"]] == ["residuals below the stated uncertainty"]
+    assert "chi2/dof is 0.01" in said["findings"][0]["words"]

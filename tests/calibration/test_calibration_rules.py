@@ -231,6 +231,21 @@ def test_what_is_not_a_number_passes_no_guard(name, model):
     assert judge(findings(e))[0] != "trustworthy"
 
 
+@pytest.mark.parametrize(
+    ("changes", "verdict"),
+    [
+        ({"chi2_dof": 6.0, "chi2": 6.0 * 369, "residual_px": 0.005, "expected_px": 0.002}, "doubtful"),
+        ({"residual_px": 300.0, "spread_px": 1500.0}, "rejected"),
+        ({"residual_px": 20.0, "spread_px": 300.0}, "rejected"),
+        ({"chi2_dof": 0.01}, "trustworthy"),
+    ],
+)
+def test_no_pass_at_chi2_dof_6_and_rejected_where_nothing_fits(changes, verdict):
+    found = findings(replace(clean(), **changes))
+    assert found, "a word at least"
+    assert judge(found)[0] == verdict
+
+
 def test_an_alternative_that_identified_errors_explain_is_dropped():
     """Poses that were trusted may prefer another convention where the machine errs; the identified model does not."""
     e = clean("kinematic")
