@@ -13,9 +13,9 @@ from tomopose.calibration.checks.alternative import Alternative
 from tomopose.calibration.checks.convention_tests import Diagnosis, ranked, set_pose_alternative
 from tomopose.calibration.checks.conventions import ALTERNATIVES
 from tomopose.calibration.checks.evidence.evidence import Undistinguished
+from tomopose.calibration.checks.evidence.undistinguished import undistinguished_readings
 from tomopose.calibration.checks.placement import require_on_panel
 from tomopose.calibration.checks.scanner_tests import ScannerTests, rows_to_test, scanner_tests
-from tomopose.calibration.checks.undistinguished import undistinguished_readings
 from tomopose.calibration.model.assumed import Assumed, scatter_assumed, taken_as_known, without_effect
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS
 from tomopose.calibration.model.covariance import inverse_information, widening
