@@ -276,9 +276,7 @@ def calibrate(
         distances=distances,
         robust=robust,
     )
-    # identified errors do not settle how the orientation columns are read
-    doubts = tuple(f for f in rigid.checks if f.rule == CONVENTION_RULE)
-    return replace(found, checks=(*found.checks, *doubts)) if doubts else found
+    return _with_doubts_of(found, rigid)
 
 
 def _require_model(model: str, *, has_geometry: bool, distances: bool) -> None:
@@ -297,6 +295,12 @@ def _said(rigid: Calibration, model: str) -> Calibration:
         return rigid
     arguments = {"model": model, **rigid.provenance.arguments}
     return replace(rigid, provenance=replace(rigid.provenance, arguments=arguments))
+
+
+def _with_doubts_of(found: Calibration, rigid: Calibration) -> Calibration:
+    """Identified errors do not settle how the orientation columns are read: that doubt stays."""
+    doubts = tuple(f for f in rigid.checks if f.rule == CONVENTION_RULE)
+    return replace(found, checks=(*found.checks, *doubts)) if doubts else found
 
 
 def freed_names(free: str | Sequence[str]) -> tuple[tuple[str, ...], bool]:
