@@ -26,8 +26,16 @@ from tomopose.studies.parts.steps import Steps
 from tomopose.studies.section6 import study as section6
 from tomopose.studies.section6.calibrations import calibrations, planned_run
 from tomopose.studies.section6.paths import ball_paths, fine_matrices, mesh_paths
+from tomopose.studies.section6.real_beam import circular_matrices
 from tomopose.studies.section6.scan import MOUNTED, WHITE, Numbers, Radiographs, grid_of, scan_with, specimen
-from tomopose.studies.section6.specimen import cylinder_areas, reference, true_lengths, unseen_by_circle
+from tomopose.studies.section6.specimen import (
+    as_made,
+    cylinder_areas,
+    reference,
+    reference_error_um,
+    true_lengths,
+    unseen_by_circle,
+)
 from tomopose.studies.section6.tables import MPE_A_UM, limit, verdict, waves
 from tomopose.studies.section6.volumes import NEAR_MM, cases_of, near
 from tomopose.trajectory.completeness import source_path
@@ -160,6 +168,35 @@ def test_a_circle_sees_upright_walls_and_not_what_faces_up():
     up = (mesh.normals @ MOUNTED.T)[:, 2] > 0.9999
     far = np.abs((mesh.points @ MOUNTED.T)[:, 2]) > 10.0
     assert unseen[up & far & ~mesh.on_edge].all()
+
+
+def test_the_probed_reference_follows_the_part_and_not_the_drawing():
+    made = as_made(TINY.edge)
+    nominal = specimen_mesh(edge=TINY.edge)
+    off = np.einsum("ij,ij->i", nominal.vertices - made.points, made.normals)[~made.on_edge]
+    nominal_um = 1e3 * np.sqrt(np.mean(off**2))
+    assert reference_error_um(TINY.edge) < min(section6.REFERENCE_UM, 0.5 * nominal_um)
+
+
+def test_a_real_beam_is_hardened_blurred_and_scattered():
+    scan = scan_with("specimen", "circular", TINY, 7)
+    ideal = Radiographs(scan)
+    real = Radiographs(replace(scan, real_beam=True))
+    L = real._paths(0)
+    behind = real.transmission(0)
+    assert behind.shape == ideal.transmission(0).shape
+    # scatter fills the shadow, hardened beam goes further through thick metal than the mean energy says
+    assert behind.min() > ideal.transmission(0).min()
+    thin, thick = (-np.log(real._beam.transmission(np.array([[x]]))[0]) / x for x in (1.0, float(L.max())))
+    assert thick < 0.98 * thin
+
+
+def test_the_circular_scan_s_own_errors_are_those_of_a_scanner():
+    scan = scan_with("specimen", "circular", TINY, 7)
+    off = circular_matrices(scan, 7)
+    x = np.array([[0.0, 0.0, 0.0], [10.0, 5.0, -20.0]])
+    px = np.abs(off.project(x) - scan.truth.project(x)).max() * scan.binning
+    assert 0.005 < px < 1.0
 
 
 def test_waves_and_verdicts():

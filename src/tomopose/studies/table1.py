@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtri as chi2_quantile
 
 from tomopose.calibration.result import Calibration
 from tomopose.calibration.solve import calibrate
@@ -41,8 +42,8 @@ GOAL_GAIN = 10.0
 """Printed over ours, one unit at a time."""
 ROUNDED_UM = 0.05
 """Half of the last printed digit of most errors: a printed error is that much off by chance."""
-LIKE_PRINTED = (0.5, 2.0)
-"""Range of chi2/9 of errors that are as large as stated: 54 of them scatter by 0.2 about 1, 18 by 0.33."""
+CHANCE = 0.0013
+"""Of a normal deviate beyond 3 standard deviations, on either side: what chi2/9 of right errors leaves by chance."""
 COVERAGE = 3.0
 """Standard uncertainties within which an error must lie: 3, since some hundred are looked at."""
 
@@ -198,19 +199,20 @@ def checks_of(rows: list[StudyRow]) -> tuple[StudyCheck, ...]:
     theirs, ours = (np.array([getattr(r, side) for r in errors]) for side in ("paper_method", "best"))
     worst = float(np.max(np.abs(ours) / np.array([r.u for r in errors])))
     printed = np.array([r.printed for r in errors])
+    like_printed = tuple(float(chi2_quantile(9 * len(chi2), p)) / (9 * len(chi2)) for p in (1 - CHANCE, CHANCE))
     size = float(np.sqrt(np.mean(theirs**2) / np.mean(printed**2)))
     return (
         *(gain_check(rows, unit) for unit in ("px", "um", "urad")),
         check_between(
             "the printed errors are as large as independent errors of the centres make them (mean chi2/9)",
             float(np.mean([r.printed for r in chi2 if r.printed is not None])),
-            *LIKE_PRINTED,
+            *like_printed,
             "",
         ),
         check_between(
             "the errors by the paper's method have the structure of the printed ones (mean chi2/9)",
             float(np.mean([r.paper_method for r in chi2 if r.paper_method is not None])),
-            *LIKE_PRINTED,
+            *like_printed,
             "",
         ),
         check_between(
