@@ -72,7 +72,8 @@ def times_usual(page) -> float:
 
 
 def settled(page) -> None:
-    page.wait_for_function("document.body.dataset.busy === '0'", timeout=240_000)
+    """Wait by selectors: the page's policy forbids to evaluate text as a script, a test's too."""
+    page.wait_for_selector("body[data-busy='0']", state="attached", timeout=600_000)
 
 
 def test_a_person_finds_every_spoilt_detection_by_keyboard_alone(browser, address, project):
@@ -81,7 +82,7 @@ def test_a_person_finds_every_spoilt_detection_by_keyboard_alone(browser, addres
         page.keyboard.press("x" if times_usual(page) > FAR else "a")
     settled(page)
     page.keyboard.press("s")
-    page.wait_for_function("document.getElementById('said').textContent.startsWith('written')", timeout=60_000)
+    page.locator("#said", has_text="written: reviewed/calibration.json").wait_for(timeout=120_000)
     decisions = read_decisions(project.cal / "review.jsonl")
     assert len(decisions) == 200
     assert sorted(d.pose_id for d in decisions if d.action == "leave-out") == list(project.spoilt)
@@ -121,14 +122,17 @@ def test_undo_move_start_and_reasons_work_by_keyboard(browser, address, project)
     assert page.locator("#decisions li").count() == 1
     page.keyboard.press("u")
     settled(page)
-    page.wait_for_function("document.querySelectorAll('#decisions li').length === 0")
+    page.wait_for_selector("#decisions:empty", state="attached")
     assert (project.cal / "review.jsonl").read_text() == ""
     assert page.said == []
 
 
 def test_the_radiograph_is_shown_with_what_was_found(browser, address):
     page = visit(browser, address)
-    page.wait_for_function(f"{PIXELS}.some((x, i) => i % 4 === 0 && x > 60)")
+    for _ in range(100):
+        if page.evaluate(f"{PIXELS}.some((x, i) => i % 4 === 0 && x > 60)"):
+            break
+        page.wait_for_timeout(100)
     colours = page.evaluate(
         f"(() => {{ const d = {PIXELS}; let found = 0, predicted = 0; for (let i = 0; i < d.length; i += 4) {{"
         "if (d[i] > 230 && d[i + 2] < 80) found += 1; if (d[i] < 90 && d[i + 2] > 230) predicted += 1; }"
