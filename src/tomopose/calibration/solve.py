@@ -224,8 +224,7 @@ def calibrate(
                   "rigid" without a manipulator, and otherwise what predicts held-out poses best.
     free:         "auto": a scanner value whose stated or assumed standard deviation the images contradict is freed,
                   and the first line says so; "none": none is; or names to estimate without a prior.
-    fix:          names of scanner values to hold: exact; see `parameters.UNITS`.  translation_scale: lengths of the
-                  manipulator's translations are exact.
+    fix:          names of scanner values to hold: exact; see `parameters.UNITS`.
     priors:       name -> prior standard deviation (mm, px, rad), in place of the scanner's.
     robust:       set aside centres that do not belong, and list them.
     hypotheses:   try the cheap alternative conventions (or those given) and say so in the verdict; all of them
@@ -265,9 +264,7 @@ def calibrate(
     from tomopose.calibration.identified.calibrate import calibrate_kinematic
 
     found = calibrate_kinematic(
-        scanner,
-        poses,
-        observations,
+        scanner, poses, observations,
         manipulator=manipulator,
         model=model,
         rigid=rigid,
@@ -275,7 +272,7 @@ def calibrate(
         auto=auto,
         distances=distances,
         robust=robust,
-    )
+    )  # fmt: skip
     return _with_doubts_of(found, rigid)
 
 
