@@ -36,6 +36,7 @@ from tomopose.geometry.projection import project_ball
 from tomopose.geometry.rotations import log_rotation
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.least_squares import Status
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.planning.design import SIGMA_PX, nominal_mount, plan_poses, predicted_covariance
@@ -118,7 +119,13 @@ def convergence(runs: int) -> None:
 
 def _truth(free: object, n: int) -> Fit:
     return Fit(
-        R_HT=MOUNT.R, t_HT=MOUNT.t, t=BALL[None], delta=np.zeros(n), chi2=0.0, converged=True, N=np.zeros((0, 0))
+        R_HT=MOUNT.R,
+        t_HT=MOUNT.t,
+        t=BALL[None],
+        delta=np.zeros(n),
+        chi2=0.0,
+        status=Status.CONVERGED,
+        N=np.zeros((0, 0)),
     )
 
 

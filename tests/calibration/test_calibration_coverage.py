@@ -20,6 +20,7 @@ from tomopose.calibration.uncertainty.monte_carlo import draw, monte_carlo
 from tomopose.calibration.uncertainty.propagation import length_sigma, matrix_point_jacobian, object_sigma
 from tomopose.geometry.projection import eq5_matrices, project
 from tomopose.geometry.rotations import exp_rotation
+from tomopose.least_squares import Status
 
 RUNS = 1000
 LOW, HIGH = 0.93, 0.97
@@ -33,7 +34,7 @@ def truth_of(free):
         t=BALL[None],
         delta=np.zeros(len(free)),
         chi2=0.0,
-        converged=True,
+        status=Status.CONVERGED,
         N=np.zeros((0, 0)),
     )
 

@@ -18,7 +18,7 @@ from manipulator_cases import (
 
 from tomopose import BallObservations, Calibration, Frame, RigidTransform
 from tomopose.calibration.identified.calibrate import calibrate_kinematic, machine_of
-from tomopose.calibration.identified.model_selection import EVIDENCE_GAIN
+from tomopose.calibration.identified.model_selection import SELECTION
 from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.calibration.solve import calibrate
 from tomopose.calibration.uncertainty.trajectory import object_points, rms_px, without_object_pose
@@ -90,7 +90,7 @@ def test_a_perfect_machine_stays_rigid(kind: str) -> None:
     np.testing.assert_array_equal(cal.T_HT.matrix, rigid.T_HT.matrix)
     assert scan_error(cal, e).shared < 0.006
     models = {m.model: m for m in cal.comparison.models}
-    assert models["kinematic"].log_evidence < models["rigid"].log_evidence + EVIDENCE_GAIN
+    assert models["kinematic"].log_evidence < models["rigid"].log_evidence + SELECTION.evidence_gain
 
 
 def test_small_errors_get_a_small_prior() -> None:

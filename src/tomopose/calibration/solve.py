@@ -122,11 +122,7 @@ def _rigid(
             fit_chi2=solution.chi2,
             dof=solution.dof,
             converged=fit.converged,
-            status=(
-                f"optimum of {len(p)} poses reached"
-                if fit.converged
-                else "the iteration ended before it reached an optimum"
-            ),
+            status=(f"optimum of {len(p)} poses reached" if fit.converged else fit.status.value),
             misfit=stated.robust.misfit,
             expected_px=expected_px(linear),
             stated_px=expected_px(linear_fit(stated.used, free, stated.fit)),

@@ -424,7 +424,7 @@ def scanner_tests(problem: Problem, free: FreeParameters, fit: Fit) -> ScannerTe
         held,
         fit
         if not len(free)
-        else Fit(R_HT=fit.R_HT, t_HT=fit.t_HT, t=fit.t, delta=np.zeros(0), chi2=fit.chi2, converged=True, N=fit.N),
+        else Fit(R_HT=fit.R_HT, t_HT=fit.t_HT, t=fit.t, delta=np.zeros(0), chi2=fit.chi2, status=fit.status, N=fit.N),
         iterations=30,
     )
     if not len(free) or not np.isfinite(plain.chi2):

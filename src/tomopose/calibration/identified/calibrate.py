@@ -16,7 +16,7 @@ from tomopose.calibration.checks.convention_tests import Diagnosis
 from tomopose.calibration.identified.fit import ModelFit, fit_model
 from tomopose.calibration.identified.geometry_prior import averaged
 from tomopose.calibration.identified.map_estimate import KinematicProblem, State
-from tomopose.calibration.identified.model_selection import EVIDENCE_GAIN, better, judged
+from tomopose.calibration.identified.model_selection import SELECTION, better, judged
 from tomopose.calibration.identified.pose_map import map_candidates
 from tomopose.calibration.identified.result import calibration_of, comparison, scatter_of_fit
 from tomopose.calibration.identified.scale_bars import require_balls_not_swapped
@@ -257,7 +257,7 @@ def _with_run_effects(problem: KinematicProblem, fit: ModelFit) -> ModelFit:
         other = fit_model(replace(problem, model=model, free=estimate.problem.free), start, keep=fit.keep)
     except NotConvergedError:
         return fit
-    if other.estimate.log_evidence > estimate.log_evidence + EVIDENCE_GAIN:
+    if other.estimate.log_evidence > estimate.log_evidence + SELECTION.evidence_gain:
         return replace(other, size=fit.size, misfit=fit.misfit, contradicted=fit.contradicted)
     return fit
 

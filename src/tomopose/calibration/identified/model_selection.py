@@ -8,6 +8,7 @@ the room it takes, and blocked cross-validation, which leaves out runs of neighb
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,11 +21,20 @@ from tomopose.geometry.scanner import Scanner
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.units import Array
 
-EVIDENCE_GAIN = 3.0
-"""Natural log units that a richer model must gain."""
-AXIS_SHARE = 0.9
-"""A pose counts as turned about one axis when that axis carries this share of its rotation."""
-SMALLEST_TURN = 1e-3
+
+class SelectionSettings(NamedTuple):
+    """Thresholds of the choice between models, and of the table of residuals by rotation."""
+
+    evidence_gain: float = 3.0
+    """Natural log units of evidence that a richer model must gain: a Bayes factor of 20, where Kass and Raftery (J. Am.
+    Stat. Assoc. 90, 1995, 773) begin to call evidence strong.  Held-out poses must be predicted better as well."""
+    axis_share: float = 0.9
+    """A pose counts as turned about one axis when that axis carries this share of its rotation: within 26 degrees."""
+    smallest_turn: float = 1e-3
+    """Rotation, rad, below which a pose counts as not turned: plans turn by degrees, controllers hold 0.1 mrad."""
+
+
+SELECTION = SelectionSettings()
 
 
 def judged(name: str, fit: ModelFit) -> ModelJudgement:
@@ -47,7 +57,7 @@ def judged(name: str, fit: ModelFit) -> ModelJudgement:
 def better(rich: ModelJudgement, simple: ModelJudgement) -> bool:
     """Whether the richer model is to replace the simpler one: more evidence, and held-out poses predicted better."""
     return (
-        rich.log_evidence > simple.log_evidence + EVIDENCE_GAIN
+        rich.log_evidence > simple.log_evidence + SELECTION.evidence_gain
         and rich.log_predictive > simple.log_predictive
         and rich.cv_rms <= simple.cv_rms
     )
@@ -65,8 +75,8 @@ def by_rotation(poses: PoseSequence, residuals: Mapping[str, Array], scanner: Sc
     main = np.take_along_axis(w, axis[:, None], axis=1)[:, 0]
     label = np.where(main > 0, "+", "-").astype("<U5")
     label = np.char.add(label, np.array(["x", "y", "z"])[axis])
-    label = np.where(np.abs(main) < AXIS_SHARE * angle, "mixed", label)
-    label = np.where(angle < SMALLEST_TURN, "none", label)
+    label = np.where(np.abs(main) < SELECTION.axis_share * angle, "mixed", label)
+    label = np.where(angle < SELECTION.smallest_turn, "none", label)
     um = float(np.sqrt(scanner.p_u * scanner.p_v)) / scanner.magnification * 1000.0
     rows = []
     for name in ("none", "+x", "-x", "+y", "-y", "+z", "-z", "mixed"):

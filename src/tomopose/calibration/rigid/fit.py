@@ -11,9 +11,10 @@ from tomopose.calibration.model.ball_projection import ProjectionBlocks, project
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, translation_scale
 from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.rigid.kernel import CONVERGED, Freed, Point, Rows, centres, levenberg_marquardt
+from tomopose.calibration.rigid.kernel import Freed, Point, Rows, centres, levenberg_marquardt
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.least_squares import CODES, Status
 from tomopose.units import Array
 
 ITERATIONS = 60
@@ -28,8 +29,12 @@ class Fit:
     t: Array
     delta: Array
     chi2: float
-    converged: bool
+    status: Status
     N: Array
+
+    @property
+    def converged(self) -> bool:
+        return self.status is Status.CONVERGED
 
     @property
     def T_HT(self) -> RigidTransform:
@@ -74,9 +79,9 @@ def minimise(
     m = 6 + 3 * len(t) + len(free)
     N = np.zeros((m, m))
     at = Point(R, t_HT, t, delta)
-    chi2, status = levenberg_marquardt(rows_of(problem, weight), freed_of(problem, free), at, iterations, N)
+    chi2, code = levenberg_marquardt(rows_of(problem, weight), freed_of(problem, free), at, iterations, N)
     U, _, V = np.linalg.svd(R)
-    return Fit(R_HT=U @ V, t_HT=t_HT, t=t, delta=delta, chi2=float(chi2), converged=status == CONVERGED, N=N)
+    return Fit(R_HT=U @ V, t_HT=t_HT, t=t, delta=delta, chi2=float(chi2), status=CODES[code], N=N)
 
 
 def residuals(problem: Problem, free: FreeParameters, fit: Fit) -> Array:

@@ -14,9 +14,11 @@ import numpy as np
 from numba import njit, prange
 
 from tomopose.calibration.model.ball_projection import NO, YES, Projected, project_pose
+from tomopose.least_squares import CODES
 from tomopose.units import Array
 
-CONVERGED, STALLED, OUT_OF_ITERATIONS, SINGULAR = 0, 1, 2, 3
+CONVERGED, STALLED, OUT_OF_STEPS, SINGULAR, NO_START = range(len(CODES))
+"""Places in least_squares.CODES: compiled code returns numbers."""
 STEP_TOLERANCE = 1e-10
 """The iteration ends when a step is shorter than this, measured in standard deviations of the estimate."""
 
@@ -227,7 +229,7 @@ def levenberg_marquardt(rows: Rows, freed: Freed, at: Point, iterations: int, N:
     _scanner_vectors(freed, at.delta, s)
     chi2 = normal_equations(rows, s, freed, at, N, g)
     if not chi2 < np.inf:
-        return np.inf, SINGULAR
+        return np.inf, NO_START
     lam, grow = 1e-4, 2.0
     for _ in range(iterations):
         if not _solve_spd(N, lam, g, L, step):
@@ -262,7 +264,7 @@ def levenberg_marquardt(rows: Rows, freed: Freed, at: Point, iterations: int, N:
             grow *= 2.0
             if lam > 1e12:
                 return chi2, STALLED
-    return chi2, OUT_OF_ITERATIONS
+    return chi2, OUT_OF_STEPS
 
 
 @njit(cache=True)

@@ -30,9 +30,12 @@ from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.rigid.fit import Fit, blocks, jacobian
 from tomopose.errors import InputError, NotConvergedError
 from tomopose.geometry.rotations import exp_rotation, rotation_angle_between, skew
+from tomopose.least_squares import Status, least_squares
 from tomopose.units import Array
 
 ITERATIONS = 200
+STEP_TOLERANCE = 1e-8
+"""Of a step, in standard deviations: the estimate then holds to more digits than anyone reads."""
 EVALUATIONS = 400
 BOUND = 12.0
 """Largest logarithm of a component against its unit that the search tries."""
@@ -197,37 +200,26 @@ def solve_with_field(problem: Problem, free: FreeParameters, start: Fit, field: 
     """
     root: Array = np.asarray(np.linalg.cholesky(field_covariance(problem, free, start, field)), dtype=np.float64)
     m, n_b = 6 + start.t.size + len(free), len(start.t)
-    prior = np.zeros((m, m))
-    prior[m - len(free) :, m - len(free) :] = np.diag(free.information)
-    fit, damping = start, 1e-3
-    b, rw, chi2 = _whitened(problem, free, fit, root)
-    for _ in range(ITERATIONS):
+    held = np.sqrt(free.information)
+    prior = np.concatenate([np.zeros((len(free), m - len(free))), np.diag(held)], axis=1)
+
+    def rows(fit: Fit) -> tuple[Array, Array]:
+        b = blocks(problem, free, fit)
+        r = np.linalg.solve(root, (problem.x_D - b.x_D).ravel())
         J = np.linalg.solve(root, jacobian(problem, free, b).reshape(-1, m))
-        N = J.T @ J + prior
-        g = J.T @ rw
-        g[m - len(free) :] -= free.information * fit.delta
-        step = np.asarray(np.linalg.solve(N + damping * np.diag(np.diag(N)), g), dtype=np.float64)
-        trial = replace(
+        return np.concatenate([r, -held * fit.delta]), np.concatenate([J, prior])
+
+    def moved(fit: Fit, step: Array) -> Fit:
+        return replace(
             fit,
             R_HT=exp_rotation(step[:3]) @ fit.R_HT,
             t_HT=fit.t_HT + step[3:6],
             t=fit.t + step[6 : 6 + 3 * n_b].reshape(n_b, 3),
             delta=fit.delta + step[6 + 3 * n_b :],
         )
-        b_new, r_new, chi2_new = _whitened(problem, free, trial, root)
-        if chi2_new <= chi2:
-            small = step @ N @ step < 1e-12
-            fit, b, rw, chi2, damping = trial, b_new, r_new, chi2_new, max(damping / 10, 1e-12)
-            if small:
-                return replace(fit, chi2=chi2, converged=True, N=N), inverse_information(N)
-        else:
-            damping *= 10
-            if damping > 1e12:
-                return replace(fit, chi2=chi2, converged=True, N=N), inverse_information(N)
-    raise NotConvergedError("generalised least squares with a shared pose error found no optimum")
 
-
-def _whitened(problem: Problem, free: FreeParameters, fit: Fit, root: Array) -> tuple[ProjectionBlocks, Array, float]:
-    b = blocks(problem, free, fit)
-    rw = np.asarray(np.linalg.solve(root, (problem.x_D - b.x_D).ravel()), dtype=np.float64)
-    return b, rw, float(rw @ rw + (free.information * fit.delta**2).sum())
+    found = least_squares(rows, moved, start, steps=ITERATIONS, tolerance=STEP_TOLERANCE)
+    if not found.status.at_rest:
+        raise NotConvergedError(f"generalised least squares with a shared pose error: {found.status.value}")
+    N = found.J.T @ found.J
+    return replace(found.state, chi2=found.cost, status=Status.CONVERGED, N=N), inverse_information(N)

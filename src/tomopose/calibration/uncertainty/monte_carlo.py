@@ -19,6 +19,7 @@ from tomopose.calibration.rigid.pose_noise import PoseNoise, total_covariance
 from tomopose.errors import InputError
 from tomopose.geometry.rotations import exp_rotation
 from tomopose.geometry.scanner import Scanner
+from tomopose.least_squares import Status
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.units import Array
@@ -132,7 +133,7 @@ def monte_carlo(
         t=np.array([calibration.balls[b] for b in problem.ball_ids]),
         delta=np.array([values[name] for name in free.names]) - free.value,
         chi2=calibration.chi2,
-        converged=True,
+        status=Status.CONVERGED,
         N=np.zeros((0, 0)),
     )
     found = calibration.pose_noise

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tomopose.errors import InputError
+from tomopose.least_squares import Status, least_squares
 from tomopose.units import Array
 
 MAX_STEPS = 200
@@ -112,32 +113,18 @@ def refine(start: Shape, points: Array, weight: Array, *, fixed_radius: bool = F
     points are centred and scaled to about one; weight (n,).
     """
     free = free_columns(start.kind, fixed_radius)
-    shape = slid(start)
-    d = weight * distances(shape, points)
-    cost, damping = float(d @ d), 1e-3
-    for _ in range(MAX_STEPS):
-        J = weight[:, None] * derivatives(shape, points)[:, free]
-        gram, gradient = J.T @ J, J.T @ d
-        step = np.zeros(free[-1] + 1 if not fixed_radius else len(free) + 1)
-        while True:
-            try:
-                step[free] = np.linalg.solve(gram + damping * np.diag(np.diag(gram) + 1e-300), -gradient)
-            except np.linalg.LinAlgError:
-                return shape, np.inf
-            trial = slid(moved(shape, step))
-            d_trial = weight * distances(trial, points)
-            cost_trial = float(d_trial @ d_trial)
-            small = float(np.abs(step).max()) < STEP_TOLERANCE
-            if np.isfinite(cost_trial) and cost_trial <= cost * (1 + 1e-13):
-                shape, d, damping = trial, d_trial, max(damping / 10, 1e-15)
-                cost = cost_trial
-                break
-            damping *= 10
-            if damping > 1e8:
-                return shape, cost
-        if small:
-            break
-    return shape, cost
+    size = free[-1] + 1 if not fixed_radius else len(free) + 1
+
+    def rows(shape: Shape) -> tuple[Array, Array]:
+        return -weight * distances(shape, points), weight[:, None] * derivatives(shape, points)[:, free]
+
+    def after(shape: Shape, step: Array) -> Shape:
+        full = np.zeros(size)
+        full[free] = step
+        return slid(moved(shape, full))
+
+    found = least_squares(rows, after, slid(start), steps=MAX_STEPS, tolerance=STEP_TOLERANCE)
+    return found.state, np.inf if found.status is Status.SINGULAR else found.cost
 
 
 def require_determined(shape: Shape, points: Array, *, fixed_radius: bool) -> None:
