@@ -22,6 +22,9 @@ LEAST_DAMPING, LARGEST_DAMPING = 1e-15, 1e10
 """Below the first a step is one of Gauss and Newton to the last bit; beyond the second it moves nothing."""
 ROUNDING = 1e-13
 """Relative growth of the sum of squares that its own rounding explains."""
+UNSEEN = 1e-10
+"""What the whole step promises, relative to the sum of squares, that rounding of the calculated values may hide: pixels
+of some thousands in residuals of hundredths carry 1e-11."""
 
 
 class Status(Enum):
@@ -98,6 +101,7 @@ def least_squares(
         if cost_new <= cost * (1 + ROUNDING):
             state, r, J, cost, damping = trial, r_new, J_new, cost_new, max(damping / 10, LEAST_DAMPING)
         else:
+            short = short or _unseen(J, r, cost)
             damping *= 10
         if short:
             return ended(Status.CONVERGED)
@@ -110,6 +114,12 @@ def _sum_of_squares(r: Array) -> float:
     """r . r; infinite where it is not a number, so that no such state is taken."""
     cost = float(r @ r)
     return cost if np.isfinite(cost) else np.inf
+
+
+def _unseen(J: Array, r: Array, cost: float) -> bool:
+    """Whether the undamped step promises less than what rounding hides."""
+    whole = _step(J, r, 0.0)
+    return whole is not None and float(np.sum((J @ whole) ** 2)) <= UNSEEN * cost
 
 
 def _step(J: Array, r: Array, damping: float) -> Array | None:
