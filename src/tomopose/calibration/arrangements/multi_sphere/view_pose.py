@@ -139,7 +139,7 @@ def _gauss_newton(
             break
         N = A.T @ A
         N[np.diag_indices(6)] *= 1 + damping
-        step: Array = np.linalg.solve(N, A.T @ z)
+        step = np.asarray(np.linalg.solve(N, A.T @ z), dtype=np.float64)
         R_new, t_new = np.asarray(exp_rotation(step[:3]) @ R, dtype=np.float64), t + step[3:]
         r_new, A_new = _weighted(P, R_new, t_new, x_D, balls, W)
         z_new = np.asarray(W @ r_new[:, :, None], dtype=np.float64).ravel()
