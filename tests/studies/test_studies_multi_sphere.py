@@ -9,7 +9,6 @@ from tomopose.geometry.rotations import R_y
 from tomopose.studies import multi_sphere
 from tomopose.studies.demo import demo_setup, paper_scanner
 from tomopose.studies.parts.virtual_hexapod import real_T_MH, scan_of
-from tomopose.studies.section6.scan import alpha_of
 
 
 def test_the_standard_is_in_view_along_the_path_and_has_an_identity():
@@ -17,7 +16,7 @@ def test_the_standard_is_in_view_along_the_path_and_has_an_identity():
     made.require_asymmetric(0.3)
     poses = scan_of(multi_sphere.MAGNIFICATION, 126)
     T_MH = real_T_MH(poses, multi_sphere.MAGNIFICATION)
-    P = eq5_matrices(fine, T_HT=demo_setup(paper=True).T_HT, T_MH=T_MH, alpha=alpha_of(poses))
+    P = eq5_matrices(fine, T_HT=demo_setup(paper=True).T_HT, T_MH=T_MH, alpha=poses.alpha)
     x = np.stack([project(p[None], made.centres @ R_y(0.2).T + [0.4, -0.7, 1.0])[0] for p in P])
     radius = 60.0
     assert (x > radius).all()
