@@ -17,6 +17,11 @@ PROBABILITY = 0.95
 """Probability with which an interval holds the truth."""
 K2 = 2.0
 """Coverage factor of quantities that are stated with k = 2 by name."""
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a normal variable over its median absolute deviation: 1 / Phi^-1(3/4) (P. J. Huber, Robust
+Statistics (1981), sec. 5.1)."""
+NORMAL_MEDIAN = 0.455
+"""Median of the square of a standard normal variable: Phi^-1(3/4)^2."""
 
 
 def coverage_factor(dof: float = math.inf, probability: float = PROBABILITY) -> float:

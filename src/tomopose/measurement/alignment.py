@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tomopose.coverage import MAD_TO_SIGMA
 from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.point_motion import rigid_motion
 from tomopose.geometry.rotations import exp_rotation, log_rotation
 from tomopose.measurement.features.shapes import frame_along
-from tomopose.robust import MAD_TO_SIGMA
 from tomopose.units import Array, float_array
 
 

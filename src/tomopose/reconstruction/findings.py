@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tomopose.coverage import MAD_TO_SIGMA
 from tomopose.engines.protocol import view_lengths
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.reconstruction.choice import CUT_ROWS, FEWEST_FOR_FDK, Situation
 from tomopose.reconstruction.fdk.redundancy import lines_missing
 from tomopose.reconstruction.field import every_nth_pixel
-from tomopose.robust import MAD_TO_SIGMA
 from tomopose.units import Array
 from tomopose.volume import VoxelGrid
 

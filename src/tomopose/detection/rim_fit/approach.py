@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from numba import njit
 
+from tomopose.coverage import MAD_TO_SIGMA
 from tomopose.detection.order_statistics import median
 from tomopose.detection.rim_fit.state import Anisotropy, Noise, Parameters, Priors, RimFit, Unknowns
 from tomopose.detection.rim_fit.steps import equal_weight, stepped, with_equal_weights
 from tomopose.detection.rim_model.ring import SHELLS, BallWindow, Ring, taken_pixels, whole_ring
 from tomopose.detection.settings import DetectionSettings
 from tomopose.errors import BallNotFoundError
-from tomopose.robust import MAD_TO_SIGMA
 from tomopose.units import Array
 
 TURNS, NEAR_ENOUGH = 14, 0.02

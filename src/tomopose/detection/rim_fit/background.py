@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from tomopose.coverage import MAD_TO_SIGMA
 from tomopose.detection.rim_fit.approach import approached, near_ring, with_weak_priors
 from tomopose.detection.rim_fit.state import RimFit, Unknowns
 from tomopose.detection.rim_fit.steps import equal_weight, stepped, with_equal_weights
 from tomopose.detection.rim_model.ring import whole_ring
-from tomopose.robust import MAD_TO_SIGMA
 
 BACKGROUND = Unknowns(curvature=False)
 ROBUST_TURNS = 6

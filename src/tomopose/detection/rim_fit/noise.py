@@ -10,12 +10,12 @@ import numpy.typing as npt
 from numba import njit
 from scipy.ndimage import convolve
 
+from tomopose.coverage import NORMAL_MEDIAN
 from tomopose.detection.order_statistics import median, select
 from tomopose.detection.rim_fit.state import Noise, RimFit
 from tomopose.detection.rim_model.ring import SHELLS
 from tomopose.detection.settings import NoiseSettings
 from tomopose.errors import BallNotFoundError
-from tomopose.robust import NORMAL_MEDIAN
 from tomopose.units import Array
 
 SHORT = 0.139

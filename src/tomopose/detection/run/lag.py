@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tomopose.coverage import MAD_TO_SIGMA
 from tomopose.detection.reading import Image, native_part
 from tomopose.detection.settings import RunSettings
-from tomopose.robust import MAD_TO_SIGMA
 from tomopose.units import Array
 
 ARCS, FEWEST_ARCS, FEWEST_PIXELS = 48, 8, 4

@@ -17,11 +17,11 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from tomopose.coverage import MAD_TO_SIGMA
 from tomopose.errors import InputError, ShapeError
 from tomopose.measurement.surface import edge_kernel as kernel
 from tomopose.measurement.surface.plateaus import shared_plateaus
 from tomopose.measurement.surface.splines import REACH, spline_coefficients
-from tomopose.robust import MAD_TO_SIGMA
 from tomopose.units import Array, float_array
 from tomopose.volume import Volume
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
-from tomopose.robust import MAD_TO_SIGMA
+from tomopose.coverage import MAD_TO_SIGMA
 from tomopose.units import Array
 
 ONE_SIDED = 0.15

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter, sobel
 
+from tomopose.coverage import MAD_TO_SIGMA
 from tomopose.errors import BallNotFoundError
 from tomopose.geometry.scanner import Scanner
-from tomopose.robust import MAD_TO_SIGMA
 from tomopose.units import Array
 
 SMOOTHING_PX = 1.4142
