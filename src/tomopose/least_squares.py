@@ -127,7 +127,7 @@ def _step(J: Array, r: Array, damping: float) -> Array | None:
     N = J.T @ J
     N[np.diag_indices(len(N))] *= 1 + damping
     try:
-        step = np.linalg.solve(N, J.T @ r)
+        step = np.asarray(np.linalg.solve(N, J.T @ r), dtype=np.float64)
     except np.linalg.LinAlgError:
         return None
     return step if np.isfinite(step).all() else None

@@ -90,6 +90,8 @@ def multi_sphere_summary(result: MultiSphereCalibration) -> tuple[dict[str, obje
     import numpy as np
 
     matrices = result.matrices()
+    assert matrices.points_sigma is not None
+    assert matrices.points_sigma_shared is not None
     sigma, shared = (
         float(np.sqrt(np.mean(np.square(s)))) for s in (matrices.points_sigma, matrices.points_sigma_shared)
     )

@@ -70,7 +70,9 @@ def open_for(
 
 def forward_of(machine: ErrorModel | None) -> Any:
     """The forward kinematics of a robot with joint values, for tables that hold nothing else."""
-    return machine.forward if hasattr(machine, "joints") else None
+    from tomopose.manipulator.serial import SerialRobot
+
+    return machine.forward if isinstance(machine, SerialRobot) else None
 
 
 def note_missing_flat(say: Say, flat: str | None) -> None:

@@ -133,6 +133,7 @@ def identified_plan(o: Options, scanner: Scanner, machine: ErrorModel) -> Identi
     import numpy as np
 
     from tomopose.calibration.uncertainty.trajectory import object_points
+    from tomopose.manipulator.serial import SerialRobot
     from tomopose.planning.design import BALL_MM, nominal_mount
     from tomopose.planning.identified_design import plan_kinematic
     from tomopose.planning.limits import candidates
@@ -140,7 +141,7 @@ def identified_plan(o: Options, scanner: Scanner, machine: ErrorModel) -> Identi
     from tomopose.planning.target import default_scan
 
     ball = np.array(BALL_MM)
-    if hasattr(machine, "joints"):
+    if isinstance(machine, SerialRobot):
         work = robot_work(
             machine,
             half_range=o.half_range,

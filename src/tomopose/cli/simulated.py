@@ -43,7 +43,7 @@ def frames(
 
     if client is not None:
         # The run travels once to each worker, not with every frame.
-        there = client.scatter(run, broadcast=True, hash=False)
+        there = client.scatter(run, broadcast=True, hash=False)  # type: ignore[no-untyped-call]
         for (_, k), image in ordered_map(_image, [(there, k) for k in wanted], executor=client):
             yield k, image
         return

@@ -94,11 +94,10 @@ class Desk:
         return decision_about(self.review, row, action, who=self.who, why=why.strip(), start=start, measured=measured)
 
     def _start(self, value: object) -> tuple[float, float]:
-        numbers = isinstance(value, list) and len(value) == 2 and all(isinstance(x, (int, float)) for x in value)
-        if not numbers or not all(math.isfinite(x) for x in value):  # type: ignore[union-attr, attr-defined]
+        numbers = [float(x) for x in value if isinstance(x, (int, float))] if isinstance(value, list) else []
+        if len(numbers) != 2 or value != numbers or not all(math.isfinite(x) for x in numbers):
             raise InputError(f"start is {value!r}; [u, v] in px is needed")
-        u, v = value  # type: ignore[misc, attr-defined]
-        return float(u), float(v)
+        return numbers[0], numbers[1]
 
 
 def make_app(desk: Desk, *, token: str) -> Guard:

@@ -131,7 +131,7 @@ def _so_far(
         state["words"] = f"{FEWEST - len(observations)} more measured poses until a first calibration."
         return None
     try:
-        found = calibrate(setup.scanner, taken, observations, raise_on_failure=False)
+        found = calibrate(setup.scanner, taken, observations)
     except TomoposeError as error:
         state["words"] = f"No calibration yet: {error}"
         return None

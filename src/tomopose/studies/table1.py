@@ -199,20 +199,22 @@ def checks_of(rows: list[StudyRow]) -> tuple[StudyCheck, ...]:
     theirs, ours = (np.array([getattr(r, side) for r in errors]) for side in ("paper_method", "best"))
     worst = float(np.max(np.abs(ours) / np.array([r.u for r in errors])))
     printed = np.array([r.printed for r in errors])
-    like_printed = tuple(float(chi2_quantile(9 * len(chi2), p)) / (9 * len(chi2)) for p in (1 - CHANCE, CHANCE))
+    low, high = (float(chi2_quantile(9 * len(chi2), p)) / (9 * len(chi2)) for p in (1 - CHANCE, CHANCE))
     size = float(np.sqrt(np.mean(theirs**2) / np.mean(printed**2)))
     return (
         *(gain_check(rows, unit) for unit in ("px", "um", "urad")),
         check_between(
             "the printed errors are as large as independent errors of the centres make them (mean chi2/9)",
             float(np.mean([r.printed for r in chi2 if r.printed is not None])),
-            *like_printed,
+            low,
+            high,
             "",
         ),
         check_between(
             "the errors by the paper's method have the structure of the printed ones (mean chi2/9)",
             float(np.mean([r.paper_method for r in chi2 if r.paper_method is not None])),
-            *like_printed,
+            low,
+            high,
             "",
         ),
         check_between(

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -126,7 +127,7 @@ def calibrate_turntable(
     free = tuple(dict.fromkeys([*free, *wanted]))
     assumed = assumed_for(scanner, free=free, fix=fix, priors=dict(priors or {}), no_effect=AXIS)
     held = [n for n in AXIS if n in scanner.sigma]
-    axis = dict.fromkeys(AXIS, 0.0)
+    axis: dict[str, Any] = dict.fromkeys(AXIS, 0.0)
     known = replace(with_assumed(scanner, assumed), **axis)
     freed = free_parameters((known,), free=free, fix=(*fix, *held), priors=priors)
     problem = KinematicProblem(

@@ -147,7 +147,7 @@ def trusted_problem(
     *,
     twin: TwinRobots,
     mount: RigidTransform,
-    balls: Mapping[int, Array] | None = None,
+    balls: Mapping[int, ArrayLike] | None = None,
     free: Sequence[str] = (),
     fix: Sequence[str] = (),
     priors: Mapping[str, float] | None = None,

@@ -301,7 +301,7 @@ def _explain(
     norm = np.linalg.norm(full, axis=0)
     # a column that the fit takes up whole has no size of its own
     unit = np.where(norm > SEEN * before, 1.0 / np.maximum(norm, 1e-300), 0.0)
-    size = np.linalg.lstsq(full * unit, rest, rcond=1e-3)[0] * unit
+    size = np.asarray(np.linalg.lstsq(full * unit, rest, rcond=1e-3)[0] * unit, dtype=np.float64)
     moved = np.linalg.solve(problem.W, (full[: 2 * white.n] @ size).reshape(-1, 2, 1))[..., 0]
     px = float(np.sqrt((moved**2).sum(axis=1).mean()))
     at = "" if c.at < 0 else problem.pose_id[c.at]

@@ -48,6 +48,8 @@ SCANNER_COLUMNS = (
 `translation_scale` (nominal 1) multiplies the translations t_MH that the manipulator reports.
 """
 
+YES: Any
+NO: Any
 YES, NO = np.bool_(True), np.bool_(False)
 """numba compiles a function once more for a plain True or False that it is called with, not for these."""
 

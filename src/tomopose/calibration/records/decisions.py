@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
@@ -138,7 +138,7 @@ def from_line(text: str, where: str) -> Decision:
     try:
         return Decision(
             **{k: _text(found, k) for k in ("pose_id", "who", "when")},
-            action=found.get("action"),
+            action=cast("Action", found.get("action")),
             why=_text({"why": "", **found}, "why"),
             judged=_pair(found.get("judged_px"), "judged_px"),
             start=_pair(found.get("start_px"), "start_px"),
@@ -207,7 +207,9 @@ def decided(observations: BallObservations, decisions: Sequence[Decision]) -> Ba
     where = {p: k for k, p in enumerate(observations.pose_id)}
     x, covariance, seen = (np.array(a) for a in (observations.x_D, observations.covariance, observations.seen))
     status = list(observations.status or ())
-    columns = {name: np.array(c) for name in OPTIONAL_COLUMNS if (c := getattr(observations, name)) is not None}
+    columns: dict[str, Any] = {
+        name: np.array(c) for name in OPTIONAL_COLUMNS if (c := getattr(observations, name)) is not None
+    }
     ellipse = None if observations.x_ellipse is None else np.array(observations.x_ellipse)
     for pose, decision in last.items():
         if pose not in where:

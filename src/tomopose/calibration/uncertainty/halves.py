@@ -25,7 +25,7 @@ SEEN = 1e-9
 """Scaled eigenvalues of the covariance below this are directions that both halves take from the priors."""
 
 
-def near_and_far(linear: LinearFit) -> tuple[Array, Array]:
+def near_and_far(linear: LinearFit) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the half of each ball's poses with the larger magnification, and of the others."""
     size, ball = np.linalg.norm(linear.J_t_HT, axis=(1, 2)), linear.problem.ball
     near = np.zeros(len(size), dtype=bool)

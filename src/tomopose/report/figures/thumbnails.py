@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -112,9 +113,17 @@ def worst_first(d: ArrayLike, seen: ArrayLike) -> list[int]:
     return [int(i) for i in np.argsort(-d, kind="stable")]
 
 
+class Frames(Protocol):
+    """Images by number: a list of arrays, or an `ImageSequence`."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, i: int, /) -> ArrayLike: ...
+
+
 def worst_thumbnails(
     observations: BallObservations,
-    images: Sequence[ArrayLike],
+    images: Frames,
     *,
     residuals: Mapping[str, float] | None = None,
     count: int = 12,

@@ -214,7 +214,7 @@ class Radiographs(Sequence[Any]):
             constant=SCATTER_CONSTANT, amount=SCATTER_AMOUNT, sigma=SCATTER_PX / self.scan.binning
         ))  # fmt: skip
 
-    def __getitem__(self, j: int) -> Any:
+    def __getitem__(self, j: int) -> Any:  # type: ignore[override]  # frames are asked for one by one
         # A frame counts 1 at least, and its last pixel is written last: 0 there says that it has not been made.
         if self._kept is not None and self._kept[j, -1, -1]:
             return self._kept[j]
