@@ -69,7 +69,8 @@ class PoseSequence(Rows):
         if twice:
             raise InputError(f"pose_id {twice[0]!r} appears more than once ({len(twice)} ids repeat); ids must differ")
         object.__setattr__(self, "pose_id", ids)
-        alpha = np.zeros(n) if self.alpha is AT_ZERO else np.asarray(self.alpha, dtype=np.float64)
+        still = self.alpha is AT_ZERO or self.alpha is None
+        alpha = np.zeros(n) if still else np.asarray(self.alpha, dtype=np.float64)
         ball_id = np.zeros(n, dtype=np.int64) if self.ball_id is None else np.array(self.ball_id, dtype=np.int64)
         for name, array in (("alpha", alpha), ("ball_id", ball_id)):
             if array.shape != (n,):
