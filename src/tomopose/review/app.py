@@ -136,7 +136,7 @@ def make_app(desk: Desk, *, token: str) -> Guard:
     return Guard(Starlette(routes=routes), token)
 
 
-def as_json(content: Mapping[str, Any], status: int = 200) -> Response:
+def as_json(content: Mapping[str, object], status: int = 200) -> Response:
     """An answer of JSON; numbers that are not finite become null."""
     from starlette.responses import Response
 

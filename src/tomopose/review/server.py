@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable
-from typing import Any
 
 from tomopose.errors import EngineMissingError, InputError
 from tomopose.review.app import INSTALL
+from tomopose.review.guard import Guard
 
 ADDRESS = "127.0.0.1"
 
@@ -32,7 +32,7 @@ def address_of(listening: socket.socket, token: str) -> str:
     return f"http://{ADDRESS}:{listening.getsockname()[1]}/{token}/"
 
 
-def serve(app: Any, listening: socket.socket, *, ready: Callable[[], object] = lambda: None) -> None:
+def serve(app: Guard, listening: socket.socket, *, ready: Callable[[], object] = lambda: None) -> None:
     """Answer requests until the process is interrupted.  EngineMissingError where uvicorn is not installed."""
     try:
         import uvicorn

@@ -124,7 +124,7 @@ def progress(setup: Setup, arrived: list[Arrived]) -> dict[str, Any]:
 
 
 def _so_far(
-    setup: Setup, taken: PoseSequence, observations: BallObservations, state: dict[str, Any]
+    setup: Setup, taken: PoseSequence, observations: BallObservations, state: dict[str, object]
 ) -> Calibration | None:
     """The calibration of what is there, its words put into the state; None where there is none yet."""
     if len(observations) < FEWEST:
