@@ -288,10 +288,10 @@ def _factor(J: Array, damping: float = 0.0) -> tuple[Array, Array] | None:
         return None
 
 
-def solve_map(problem: KinematicProblem, start: State, *, steps: int = STEPS) -> MapEstimate:
+def solve_map(problem: KinematicProblem, start: State, *, steps: int = STEPS, unfinished: bool = False) -> MapEstimate:
     """Levenberg-Marquardt from `start`, the weights renewed at every step, of which there are at most `steps`.
 
-    Raises NotConvergedError where no optimum is reached.
+    unfinished: where no optimum is reached, the state that was; otherwise NotConvergedError.
     """
     state, damping, drop = start, 0.0, np.inf
     r, J, at, W = _weighted(problem, state)
@@ -313,6 +313,8 @@ def solve_map(problem: KinematicProblem, start: State, *, steps: int = STEPS) ->
                 break
             damping = max(damping * 10, LEAST_DAMPING)
             if damping > LARGEST_DAMPING:
+                if unfinished:
+                    return _estimate(problem, state, r, J, at, step)
                 raise NotConvergedError(f"step {step}: no direction lowers chi2 = {r @ r:.6g}, and it is no optimum")
         state, at = trial, new[2]
         W = whiteners(at.C)
@@ -320,7 +322,7 @@ def solve_map(problem: KinematicProblem, start: State, *, steps: int = STEPS) ->
         if abs(drop) < COST_TOLERANCE * len(r) and damping < 1.0:
             return _estimate(problem, state, r, J, at, step)
         damping = damping / 10 if damping > LEAST_DAMPING else 0.0
-    if abs(drop) < VALLEY_TOLERANCE * len(r):
+    if unfinished or abs(drop) < VALLEY_TOLERANCE * len(r):
         return _estimate(problem, state, r, J, at, steps)
     raise NotConvergedError(f"no optimum after {steps} steps; the last one still gained {drop:.3g} in chi2")
 
