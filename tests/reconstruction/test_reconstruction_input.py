@@ -52,7 +52,7 @@ def attempt(images=IMAGES, matrices=MATRICES, grid=GRID, **settings):
         (IMAGES[::-1], "views in reverse order"),
         (np.zeros_like(IMAGES), "no contrast"),
         (IMAGES.astype(complex), "real numbers"),
-        (iter(IMAGES), "need a length"),
+        (iter(IMAGES), "an iterator was given"),
     ],
 )
 def test_images_that_do_not_match_are_named(images, message):

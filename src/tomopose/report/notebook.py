@@ -17,6 +17,7 @@ from tomopose.report.figures.thumbnails import Thumbnail, worst_thumbnails
 from tomopose.report.gather import Joined, join
 from tomopose.report.page import Figure
 from tomopose.report.style import ORANGE, axis, layout
+from tomopose.values import require_types
 
 if TYPE_CHECKING:
     import plotly.graph_objects
@@ -54,6 +55,7 @@ def _require(value: object, kind: type, name: str, reads: str) -> None:
         raise InputError(f"{name} must be a {kind.__name__}; a {type(value).__name__} was given{hint}")
 
 
+@require_types
 def plot_residuals(
     calibration: Calibration,
     *,
@@ -85,18 +87,21 @@ def plot_residuals(
     return as_plotly(figure)
 
 
+@require_types
 def plot_scan(matrices: ProjectionMatrices) -> plotly.graph_objects.Figure:
     """The path of the source about the object, in W, mm (paper, fig. 9)."""
     _require(matrices, ProjectionMatrices, "matrices", "read_matrices")
     return as_plotly(scene_figures.source_path(matrices))
 
 
+@require_types
 def plot_observability(calibration: Calibration) -> plotly.graph_objects.Figure:
     """Correlations of all estimated coordinates: what the poses can and cannot distinguish."""
     _require(calibration, Calibration, "calibration", "read_calibration")
     return as_plotly(coverage_figures.correlation_map(calibration))
 
 
+@require_types
 def plot_detections(
     observations: BallObservations, images: Sequence[Any], *, count: int = 8
 ) -> plotly.graph_objects.Figure:

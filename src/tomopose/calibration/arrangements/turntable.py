@@ -59,6 +59,7 @@ from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import Repeatability
 from tomopose.observations import BallObservations
 from tomopose.provenance import provenance
+from tomopose.values import require_types
 
 AXIS = ("axis_y", "axis_tilt_x", "axis_tilt_y")
 """Zero by the definition of W."""
@@ -83,6 +84,7 @@ MIRRORED = "rows flipped"
 """A mirror image of the balls in a plane across the axis: no set of circles distinguishes it."""
 
 
+@require_types
 def calibrate_turntable(
     scanner: Scanner,
     poses: PoseSequence,
@@ -247,6 +249,7 @@ def _rows_of(poses: PoseSequence, data: Problem) -> PoseSequence:
     return replace(poses.select(poses.index_of(data.pose_id)), alpha=data.alpha)
 
 
+@require_types
 def diagnose_turntable(
     scanner: Scanner,
     poses: PoseSequence,

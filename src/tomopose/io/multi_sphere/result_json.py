@@ -10,10 +10,12 @@ from tomopose.calibration.arrangements.multi_sphere.result import MultiSphereCal
 from tomopose.files import require_absent, write_json
 from tomopose.io.scanner_json import scanner_document
 from tomopose.observations import BallObservations
+from tomopose.values import require_types
 
 SCHEMA_NAME = "multi-sphere"
 
 
+@require_types
 def write_multi_sphere(path: str | Path, result: MultiSphereCalibration, *, force: bool = False) -> None:
     """Write multi-sphere.json.  FileError if the file exists and `force` is not given."""
     path = require_absent(path, force=force)

@@ -15,6 +15,7 @@ from tomopose.errors import InputError, TomoposeError
 from tomopose.files import require_absent, write_text
 from tomopose.io.table_text import format_table, read_table, unknown_column
 from tomopose.reading import reader
+from tomopose.values import require_types
 
 NAME, OTHER_NAME, SIGMA = "ball", "sphere", "sigma_mm"
 COORDINATES = ("x_mm", "y_mm", "z_mm")
@@ -57,6 +58,7 @@ def read_standard(path: str | Path) -> SphereStandard:
         raise InputError(f"{table.path}: {error}") from error
 
 
+@require_types
 def write_standard(path: str | Path, standard: SphereStandard, *, force: bool = False) -> None:
     """Write standard.csv.  FileError if the file exists and `force` is not given."""
     columns = {

@@ -23,6 +23,7 @@ from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import Repeatability
 from tomopose.units import Array
+from tomopose.values import require_types
 
 FAR = 5.0
 """Standard uncertainties beyond which a centre is set aside: by chance one in 3e5."""
@@ -48,6 +49,7 @@ class _Found:
     left_out: tuple[str, ...]
 
 
+@require_types
 def calibrate_multi_sphere(
     scanner: Scanner,
     poses: PoseSequence,
