@@ -84,6 +84,7 @@ from tomopose.cli.main import Terminated
 def end(number, frame):
     raise Terminated
 signal.signal(signal.SIGTERM, end)
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a program in the background inherits that it is ignored
 write, folder = kills.WRITERS[sys.argv[2]], Path(sys.argv[3])
 try:
     for k in itertools.count():

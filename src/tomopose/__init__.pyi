@@ -28,6 +28,7 @@ from .calibration.checks.stability import RepeatedPose as RepeatedPose
 from .calibration.checks.stability import Stability as Stability
 from .calibration.checks.verdict import Finding as Finding
 from .calibration.model.assumed import Assumed as Assumed
+from .calibration.model.budget import Halves as Halves
 from .calibration.model.budget import ScanBudget as ScanBudget
 from .calibration.model.problem import Problem as Problem
 from .calibration.model.unseen import Unseen as Unseen

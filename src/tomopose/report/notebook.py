@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import plotly.graph_objects
 
 from tomopose.calibration.result import Calibration
-from tomopose.errors import EngineMissingError, InputError, ShapeError
+from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
@@ -18,9 +19,6 @@ from tomopose.report.gather import Joined, join
 from tomopose.report.page import Figure
 from tomopose.report.style import ORANGE, axis, layout
 from tomopose.values import require_types
-
-if TYPE_CHECKING:
-    import plotly.graph_objects
 
 RESIDUALS: Mapping[str, Callable[[Calibration, Joined], Figure | None]] = {
     "pose": lambda calibration, joined: residual_figures.by_pose(joined),
@@ -37,14 +35,10 @@ BLUE = "#39c0ff"
 
 
 def as_plotly(figure: Figure) -> plotly.graph_objects.Figure:
-    """A report's figure as one of plotly's, with its title; EngineMissingError where plotly is not installed."""
-    try:
-        import plotly.graph_objects as go
-    except ImportError as error:
-        raise EngineMissingError("figures in a notebook need plotly", install_line="pip install plotly") from error
+    """A report's figure as one of plotly's, with its title."""
     margin = {**dict(figure.layout.get("margin", {})), "t": 64}
     title = {"text": figure.title, "x": 0.02, "y": 0.98, "yanchor": "top", "font": {"size": 15}}
-    return go.Figure(
+    return plotly.graph_objects.Figure(
         data=list(figure.data), layout={**figure.layout, "title": title, "margin": margin, "height": figure.height}
     )
 
