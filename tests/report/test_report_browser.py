@@ -101,7 +101,7 @@ def test_plots_are_drawn_when_they_are_scrolled_to(browser, sample, scan, tmp_pa
     before = visit.drawn
     assert before < 15
     visit.page.locator(".plot").last.scroll_into_view_if_needed()
-    visit.page.wait_for_function("document.querySelectorAll('.plot')[14].dataset.drawn === 'yes'")
+    visit.page.locator(".plot").nth(14).and_(visit.page.locator("[data-drawn='yes']")).wait_for()
     assert visit.drawn > before
 
 

@@ -159,6 +159,8 @@ def without_confirmation(text: str) -> str:
 
 def _confirms_convention(table: TextTable) -> bool:
     """`# convention: NAME, confirmed`, or a named convention in a table whose units the user vouches for."""
+    if "convention" not in table.comments:
+        return True  # the columns rx_deg, ry_deg, rz_deg are then what the format says that they are
     named = table.comments.get("convention", "")
     return bool(named) and (named.endswith(CONFIRMED) or table.comments.get("units") == CONFIRMED)
 

@@ -26,14 +26,12 @@ from tomopose.reading import parse_json, read_text, reader, require_file, requir
 from tomopose.reading.hdf5 import checked_hdf5
 from tomopose.reading.memory import require_memory
 from tomopose.units import Array
-from tomopose.values import require_types
 from tomopose.volume import Volume, VoxelGrid
 
 SCHEMA = "tomopose/volume/1"
 SUFFIXES = (".h5", ".tif", ".tiff", ".nrrd", ".mhd")
 
 
-@require_types
 def write_volume(path: str | Path, volume: Volume, *, force: bool = False) -> Path:
     """Write a volume in the format that the suffix names: .h5, .tif, .tiff, .nrrd or .mhd (with a .raw beside it).
 

@@ -16,9 +16,11 @@ from tomopose.observations import BallObservations
 from tomopose.units import Array
 from tomopose.values import require_types
 
+Centres = ArrayLike | Mapping[int, ArrayLike]
+
 
 def d_exact(
-    scanner: Scanner, poses: PoseSequence, observations: BallObservations, *, T_HT: RigidTransform, t: ArrayLike
+    scanner: Scanner, poses: PoseSequence, observations: BallObservations, *, T_HT: RigidTransform, t: Centres
 ) -> Array:
     """d_k (m,), px, of the m observations that count as seen: their distance from the exact centres.  Eq. (9).
 
@@ -39,7 +41,7 @@ def d_exact(
 
 @require_types
 def d_rms_exact(
-    scanner: Scanner, poses: PoseSequence, observations: BallObservations, *, T_HT: RigidTransform, t: ArrayLike
+    scanner: Scanner, poses: PoseSequence, observations: BallObservations, *, T_HT: RigidTransform, t: Centres
 ) -> float:
     """Error of the detection itself, px, rms over the seen poses.  Eq. (9)."""
     d = d_exact(scanner, poses, observations, T_HT=T_HT, t=t)
