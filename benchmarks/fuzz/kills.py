@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import zipfile
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -105,12 +106,13 @@ def content(folder: Path) -> dict[str, str]:
 def _digest(path: Path) -> str:
     try:
         return hashlib.sha256(essence(path).encode()).hexdigest()
-    except (OSError, ValueError) as error:  # part of a file, which no state is
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:  # part of a file, which no state is
         return f"unreadable: {error}"
 
 
 def visible(folder: Path) -> dict[str, str]:
-    return {name: digest for name, digest in content(folder).items() if not Path(name).name.startswith(".")}
+    """Without files and folders under temporary names."""
+    return {name: digest for name, digest in content(folder).items() if not name.startswith(".") and "/." not in name}
 
 
 def differences(found: dict[str, str], states: list[dict[str, str]]) -> list[str]:

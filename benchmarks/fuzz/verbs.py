@@ -35,7 +35,9 @@ v_0_px = 31.0
 n_u_px = 61
 n_v_px = 63
 """
-TIMES = re.compile(rb"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d[^\"<\s]*")
+TIMES = re.compile(
+    rb"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d[^\"<\s]*|[A-Z][a-z]{2} [A-Z][a-z]{2} [ \d]\d \d\d:\d\d:\d\d \d{4}"
+)
 CHANGING = ("provenance", "digest", "content_sha256", "utc", "created", "manifest")
 
 

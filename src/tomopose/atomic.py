@@ -84,7 +84,8 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
         raise FileError(f"{str(path)[:300]} cannot be written: {error.strerror or error}", path=path) from error
     finally:
         if temporary is not None:
-            temporary.unlink(missing_ok=True)
+            with deferred_signals():
+                temporary.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -120,7 +121,8 @@ def atomic_folder(path: str | Path, *, force: bool = False, stale: Iterable[str]
         raise FileError(f"{str(path)[:300]} cannot be written: {error.strerror or error}", path=path) from error
     finally:
         if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
+            with deferred_signals():
+                shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _beside(folder: Path) -> Path:

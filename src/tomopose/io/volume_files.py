@@ -26,6 +26,7 @@ from tomopose.reading import parse_json, read_text, reader, require_file, requir
 from tomopose.reading.hdf5 import checked_hdf5
 from tomopose.reading.memory import require_memory
 from tomopose.units import Array
+from tomopose.values import require_types
 from tomopose.volume import Volume, VoxelGrid
 
 SCHEMA = "tomopose/volume/1"
@@ -43,6 +44,11 @@ def write_volume(path: str | Path, volume: Volume, *, force: bool = False) -> Pa
             "write_volume(path, volume) is the order now, as of all writers", DeprecationWarning, stacklevel=2
         )
         path, volume = cast(str | Path, volume), cast(Volume, path)
+    return _write(path, volume, force=force)
+
+
+@require_types
+def _write(path: str | Path, volume: Volume, *, force: bool) -> Path:
     path = Path(path)
     writer = {
         ".h5": _write_hdf5,

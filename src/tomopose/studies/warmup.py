@@ -64,11 +64,12 @@ def calibrate_rigid(setup: DemoSetup | None = None) -> None:
 
 
 def reconstruct_all() -> None:
-    """The CPU engine's algorithms on a few small views of nothing."""
+    """The CPU engine's algorithms on a few small views of a disc that stays where it is."""
     from tomopose.reconstruction.run import reconstruct
 
     matrices, grid = circle(40), VoxelGrid.cube(n=12, spacing=0.3)
-    images = [np.zeros((matrices.n_v, matrices.n_u), np.float32)] * len(matrices.P)
+    v, u = np.mgrid[: matrices.n_v, : matrices.n_u] - 15.5
+    images = [np.where(np.hypot(u, v) < 8.0, 1.0, 0.0).astype(np.float32)] * len(matrices.P)
     for algorithm in ("fdk", "sart", "ossart", "cgls"):
         reconstruct(
             images, matrices, grid, images_are="line-integrals", algorithm=algorithm, engine="cpu", consistency="off"
