@@ -11,7 +11,9 @@ import pytest
 
 import tomopose as tp
 from tomopose.cli.main import run
+from tomopose.cli.plan_scan import PartOptions
 from tomopose.io.foreign.reading import read_pose_log
+from tomopose.planning.part.settings import PartSettings
 
 SCANNER = tp.Scanner(
     d_SD=1000.0,
@@ -122,3 +124,12 @@ def test_files_that_exist_are_kept(words, tmp_path, capsys):
     assert run([*words, "--mu-per-mm", "0.05"]) == 1
     assert (tmp_path / "scan.html").read_text() == "mine"
     assert not (tmp_path / "scan.csv").exists()
+
+
+def test_the_defaults_of_the_options_are_those_of_the_library():
+    options, settings = PartOptions(), PartSettings(mu=1.0)
+    for option, degrees in {"tangent": True, "tuy": True, "least_transmission": False, "margin": False}.items():
+        there = getattr(settings, {"tuy": "tuy_width"}.get(option, option))
+        assert getattr(options, option) == pytest.approx(np.degrees(there) if degrees else there), option
+    for option in ("quanta", "blur", "seed"):
+        assert getattr(options, option) == getattr(settings, option), option

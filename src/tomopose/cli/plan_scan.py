@@ -296,7 +296,7 @@ def _write(o: Options, plan: PartScanPlan, attenuation: str, free: Sequence[Free
     document["freedoms"] = [{"name": f.name, "J": f.J, "gain": f.gain} for f in free]
     document["placing"] = None if placing is None else placing.document()
     mesh = plan.goal.part.mesh
-    surface = PartSurface.of(mesh.points, mesh.faces, plan.goal.x, plan.seen)
+    surface = PartSurface.of(mesh.points, mesh.faces, plan.goal.x, plan.chosen.seen)
     page = scan_plan_report(cast("ScanPlanFigures", document), surface, plan.source_path)
     paths = _beside(o)
     tp.write_poses(paths[0], plan.poses, force=o.force)

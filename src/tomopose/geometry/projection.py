@@ -60,19 +60,19 @@ def project_ball(
     return result
 
 
-def eq5_matrices(
+def object_motion(
     scanner: Scanner,
     *,
     T_HT: RigidTransform,
     T_MH: RigidTransform,
     alpha: Array | float = 0.0,
     home: RigidTransform | None = None,
-) -> Array:
-    """The matrices P_j (n, 3, 4) that take points of W, object at home, to pixels.  Eq. (5).
+) -> RigidTransform:
+    """The motions (n) of the object from home to each pose, W -> W: the chain of eq. (5) without the scanner.
 
     Home is table angle 0 and manipulator at zero, so that x_W0 = home x_M; the printed T_HT^-1 of eq. (5) denotes
     the inverse of (T_TW,0 T_HT T_MH,0) with two identities.  home: another T_MH,0, such as a robot's working pose,
-    whose zero is far from the scanner.  |P[2, :3]| = 1 and w is the depth in mm.
+    whose zero is far from the scanner.
     """
     T_HT, T_MH = T_HT.require(Frame.H, Frame.T), T_MH.require(Frame.M, Frame.H)
     n = len(T_MH)
@@ -85,8 +85,23 @@ def eq5_matrices(
     home_inv = RigidTransform(
         R=np.broadcast_to(home.inv.R, (n, 3, 3)), t=np.broadcast_to(home.inv.t, (n, 3)), source=Frame.W, target=Frame.M
     )
-    chain = T_TW @ T_HT_n @ T_MH @ home_inv
-    return scanner.P_S @ (scanner.T_WS.matrix @ chain.matrix)
+    return T_TW @ T_HT_n @ T_MH @ home_inv
+
+
+def eq5_matrices(
+    scanner: Scanner,
+    *,
+    T_HT: RigidTransform,
+    T_MH: RigidTransform,
+    alpha: Array | float = 0.0,
+    home: RigidTransform | None = None,
+) -> Array:
+    """The matrices P_j (n, 3, 4) that take points of W, object at home, to pixels.  Eq. (5).
+
+    home: as in `object_motion`.  |P[2, :3]| = 1 and w is the depth in mm.
+    """
+    motion = object_motion(scanner, T_HT=T_HT, T_MH=T_MH, alpha=alpha, home=home)
+    return scanner.P_S @ (scanner.T_WS.matrix @ motion.matrix)
 
 
 def canonical(P: ArrayLike, in_front: ArrayLike = (0.0, 0.0, 0.0)) -> Array:

@@ -45,6 +45,14 @@ class Part:
         hull: Array = x[ConvexHull(x).vertices]
         return hull
 
+    @cached_property
+    def hull_planes(self) -> Array:
+        """(k, 4) planes of the hull: x lies in it where planes[:, :3] x + planes[:, 3] <= 0 for all of them, mm."""
+        from scipy.spatial import ConvexHull
+
+        planes: Array = np.unique(np.round(ConvexHull(self.hull).equations, 12), axis=0)
+        return planes
+
     @property
     def centre(self) -> Array:
         """(3,) middle of the bounding box, mm."""

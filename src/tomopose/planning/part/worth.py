@@ -12,6 +12,7 @@ C and T are of the form sum_e w_e max_j a_je, and M is a sum over views: J is mo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -36,12 +37,12 @@ class Goal:
     planes: Array
     settings: PartSettings
 
-    @property
+    @cached_property
     def x(self) -> Array:
         """(m, 3) points of all targets, mm."""
         return np.concatenate([t.x for t in self.targets])
 
-    @property
+    @cached_property
     def n(self) -> Array:
         """(m, 3) their normals."""
         return np.concatenate([t.n for t in self.targets])
@@ -52,7 +53,7 @@ class Goal:
         ends = np.cumsum([0, *(len(t.x) for t in self.targets)])
         return {t.name: slice(int(a), int(b)) for t, a, b in zip(self.targets, ends[:-1], ends[1:], strict=True)}
 
-    @property
+    @cached_property
     def w(self) -> Array:
         seen = [np.full(len(t.x), WEIGHTS[0] / len(self.targets) / len(t.x)) for t in self.targets]
         elements = len(self.x_tuy) * len(self.planes)

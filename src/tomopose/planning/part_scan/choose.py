@@ -98,8 +98,8 @@ def _exchange(A: np.ndarray, m: np.ndarray, w: np.ndarray, rows: np.ndarray) -> 
     taken = np.zeros(len(A), dtype=np.bool_)
     taken[rows] = True
     changed = 0
+    best, second, who = without_each(A, rows)
     for i in range(len(rows)):
-        best, second, who = without_each(A, rows)
         base = np.where(who == i, second, best)
         own = _gain(A[rows[i]], base, w) + m[rows[i]]
         j, gain = _best_addition(A, m, base, w, np.full(len(A), np.inf), taken)
@@ -107,6 +107,7 @@ def _exchange(A: np.ndarray, m: np.ndarray, w: np.ndarray, rows: np.ndarray) -> 
             taken[rows[i]], taken[j] = False, True
             rows[i] = j
             changed += 1
+            best, second, who = without_each(A, rows)
     return changed
 
 

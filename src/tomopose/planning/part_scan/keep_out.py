@@ -72,14 +72,11 @@ def _surrounds(corners: Array, x: Array) -> bool:
     return bool(abs(angle.sum()) > 2 * np.pi)
 
 
-def hits(obstacle: Obstacle, hull: Array, motions: tuple[RigidTransform, RigidTransform]) -> np.ndarray:
+def hits(obstacle: Obstacle, hull: Array, planes: Array, motions: tuple[RigidTransform, RigidTransform]) -> np.ndarray:
     """(n,) bool: in which poses the convex hull of points (h, 3), part at home, meets the obstacle.
 
-    motions: (part at home in W -> W, table -> W) of n poses.
+    planes: (k, 4) of that hull;  motions: (part at home in W -> W, table -> W) of n poses.
     """
-    from scipy.spatial import ConvexHull
-
-    planes = np.unique(np.round(ConvexHull(hull).equations, 12), axis=0)
     moved, T_TW = motions
     x, faces = obstacle.mesh.points, obstacle.mesh.faces
     n = len(moved.t)

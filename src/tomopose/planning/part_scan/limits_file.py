@@ -95,7 +95,8 @@ def _time(given: dict[str, object]) -> MoveTime:
     unknown = sorted(set(given) - set(TIME))
     if unknown:
         raise InputError(f"limits: [time] does not know {', '.join(unknown)}; it knows {', '.join(TIME)}")
-    wrong = sorted(k for k, v in given.items() if isinstance(v, bool) or not isinstance(v, (int, float)))
+    numbers = {k: v for k, v in given.items() if isinstance(v, (int, float)) and not isinstance(v, bool)}
+    wrong = sorted(set(given) - set(numbers))
     if wrong:
         raise InputError(f"limits: [time] {wrong[0]} is {given[wrong[0]]!r}; a number is needed")
     names = {
@@ -105,7 +106,7 @@ def _time(given: dict[str, object]) -> MoveTime:
         "image_s": "image",
         "limit_s": "limit",
     }
-    return MoveTime(**{names[k]: float(str(v)) for k, v in given.items()})
+    return MoveTime(**{names[k]: float(v) for k, v in numbers.items()})
 
 
 def _obstacle(name: str, given: object, folder: Path) -> Obstacle:

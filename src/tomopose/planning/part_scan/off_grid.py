@@ -24,9 +24,9 @@ def refine_off_grid(goal: Goal, machine: Machine, q: Array, views: Views) -> tup
     A, tau, incidence = (np.array(a) for a in (views.A, views.tau, views.incidence))
     s = goal.settings
     full = np.array([s.alpha_step, s.tilt_step, s.tilt_step, LIFT_STEP_MM])
+    best, second, who = without_each(A, np.arange(n))
     for halving in range(1, ROUNDS + 1):
         for i in range(n):
-            best, second, who = without_each(A, np.arange(n))
             base = np.where(who == i, second, best)
             around = _neighbours(machine, q[i], full / 2**halving)
             around = around[allowed(machine, goal.part, around, margin=s.margin)]
@@ -38,6 +38,7 @@ def refine_off_grid(goal: Goal, machine: Machine, q: Array, views: Views) -> tup
             k = int(np.argmax(gains))
             if gains[k] > own + 1e-9:
                 q[i], A[i], tau[i], incidence[i] = around[k], tried.A[k], tried.tau[k], tried.incidence[k]
+                best, second, who = without_each(A, np.arange(n))
     return q, Views(A=A, tau=tau, incidence=incidence)
 
 

@@ -30,6 +30,7 @@ class Judged:
     """A path with what it is worth on points that nothing was planned with.
 
     q: (n, 7) axes, mm and rad;  travel: mm + deg;  duration: s;  tau: (n,) mean transmission of each view;
+    seen: (m,) how many views show each point that it was judged on;
     out_of_view: views in which the part leaves the panel or hits an obstacle; those are counted as if they did not.
     """
 
@@ -40,6 +41,7 @@ class Judged:
     travel: float
     duration: float
     tau: Array
+    seen: Array
     out_of_view: int
 
 
@@ -52,7 +54,7 @@ class PartScanPlan:
     candidates: how many were allowed.
     chosen:    the plan, and `paths`: circular, triangle and sine with as many views, all judged on the same points.
     unseen:    feature -> why no allowed view shows some of it, and what would.
-    seen:      (m,) how many views show each judged point of the targets;  goal: those points.
+    goal:      the points that all paths were judged on.
     dropped:   views left out to keep the time limit, with the J that they would have added.
     """
 
@@ -63,7 +65,6 @@ class PartScanPlan:
     chosen: Judged
     paths: Mapping[str, Judged]
     unseen: Mapping[str, str]
-    seen: Array
     goal: Goal
     settings: PartSettings
     machine: Machine
@@ -121,7 +122,6 @@ def plan_part_scan(setting: Setting, *, progress: Progress = _silent) -> PartSca
         chosen=judge(q),
         paths={name: judge(path) for name, path in usual_paths(machine, len(q)).items()},
         unseen=_unseen(goal, machine, q_all, tables),
-        seen=(table(judge.goal, machine.matrices(q)).A[:, : len(judge.goal.x)] > 0).sum(axis=0),
         goal=judge.goal,
         settings=setting.settings,
         machine=machine,
@@ -195,5 +195,6 @@ class _Judge:
             travel=travel(self.machine, q),
             duration=duration(self.machine, self.setting.limits.time, q),
             tau=views.M,
+            seen=(views.A[:, : len(goal.x)] > 0).sum(axis=0),
             out_of_view=int((~allowed(self.machine, goal.part, q, margin=0.0)).sum()),
         )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tomopose.errors import InputError, OutOfReachError
-from tomopose.geometry.projection import eq5_matrices, project
+from tomopose.geometry.projection import eq5_matrices, object_motion, project
 from tomopose.geometry.rotations import rotation_from_convention
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
@@ -78,23 +78,14 @@ def allowed(machine: Machine, part: Part, q: Array, *, margin: float) -> np.ndar
     good &= seen
     for obstacle in machine.obstacles:
         index = np.flatnonzero(good)
-        good[index] &= ~hits(obstacle, part.hull, _motions(machine, q[index]))
+        good[index] &= ~hits(obstacle, part.hull, part.hull_planes, _motions(machine, q[index]))
     return np.asarray(good)
 
 
 def _motions(machine: Machine, q: Array) -> tuple[RigidTransform, RigidTransform]:
     """(part at home in W -> W, table -> W) of axes (n, 7)."""
-    poses, alpha = machine.poses(q), q[:, 6]
-    T_TW = machine.scanner.T_TW(alpha)
-    T_HT, n = machine.T_HT, len(q)
-    mount = RigidTransform(
-        R=np.broadcast_to(T_HT.R, (n, 3, 3)), t=np.broadcast_to(T_HT.t, (n, 3)), source=T_HT.source, target=T_HT.target
-    )
-    home = (machine.scanner.T_TW(0.0) @ T_HT).inv
-    R = T_TW.R @ mount.R @ poses.T_MH.R
-    t = np.einsum("nij,nj->ni", T_TW.R, np.einsum("nij,nj->ni", mount.R, poses.T_MH.t) + mount.t) + T_TW.t
-    W = T_TW.target
-    return RigidTransform(R=R @ home.R, t=np.einsum("nij,j->ni", R, home.t) + t, source=W, target=W), T_TW
+    moved = object_motion(machine.scanner, T_HT=machine.T_HT, T_MH=machine.poses(q).T_MH, alpha=q[:, 6])
+    return moved, machine.scanner.T_TW(q[:, 6])
 
 
 def tilted(machine: Machine, alpha: Array, tilt: Array, lift: Array, centre: Array) -> Array:
