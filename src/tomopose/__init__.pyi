@@ -178,6 +178,7 @@ from .reconstruction.settings import OSSART as OSSART
 from .reconstruction.settings import SART as SART
 from .reconstruction.settings import EarlierOptions as EarlierOptions
 from .reconstruction.settings import Execution as Execution
+from .report.notebook import PlotlyFigure as PlotlyFigure
 from .report.notebook import plot_detections as plot_detections
 from .report.notebook import plot_observability as plot_observability
 from .report.notebook import plot_residuals as plot_residuals
@@ -235,6 +236,7 @@ from .trajectory.feasibility import TravelLimits as TravelLimits
 from .trajectory.pose_grid import pose_grid as pose_grid
 from .trajectory.scan import circular_scan as circular_scan
 from .trajectory.scan import tilted_scan as tilted_scan
+from .values.images import Images as Images
 from .volume import Volume as Volume
 from .volume import VoxelGrid as VoxelGrid
 

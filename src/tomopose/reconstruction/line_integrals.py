@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from tomopose.errors import ConventionError, InputError, ShapeError
 from tomopose.geometry.projection import ProjectionMatrices
+from tomopose.values import Images
 
 ImagesAre = Literal["transmission", "line-integrals", "counts"]
 KINDS = ("transmission", "line-integrals", "counts")
@@ -116,7 +117,7 @@ class LineIntegrals:
     Every fault is an InputError that names the view, how many pixels, and what to do.
     """
 
-    def __init__(self, images: Sequence[object], matrices: ProjectionMatrices, correction: Correction) -> None:
+    def __init__(self, images: Images, matrices: ProjectionMatrices, correction: Correction) -> None:
         if not hasattr(images, "__len__"):
             raise InputError("the images need a length; give a list, an array (n, n_v, n_u) or open_images(...)")
         if len(images) != len(matrices):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal, Unpack
 
@@ -34,15 +34,13 @@ from tomopose.reconstruction.settings import (
     with_earlier,
 )
 from tomopose.reconstruction.work import Work, solve
-from tomopose.values import require_types
+from tomopose.values import Images, require_types
 from tomopose.volume import Volume, VoxelGrid
-
-Image = npt.NDArray[np.generic]
 
 
 @require_types
 def reconstruct(
-    images: Sequence[Image],
+    images: Images,
     matrices: ProjectionMatrices,
     grid: VoxelGrid,
     *,
@@ -145,7 +143,7 @@ def support_of(mask: npt.NDArray[np.bool_] | None, grid: VoxelGrid) -> npt.NDArr
 
 
 def line_integrals_of(
-    images: Sequence[Image], matrices: ProjectionMatrices, images_are: ImagesAre | None, correction: Correction | None
+    images: Images, matrices: ProjectionMatrices, images_are: ImagesAre | None, correction: Correction | None
 ) -> LineIntegrals:
     """The scan's line integrals, rings taken out where the correction asks for it."""
     said = correction.images_are if correction is not None else None

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol, cast
 
 import numpy as np
 import plotly.graph_objects
@@ -18,7 +19,7 @@ from tomopose.report.figures.thumbnails import Thumbnail, worst_thumbnails
 from tomopose.report.gather import Joined, join
 from tomopose.report.page import Figure
 from tomopose.report.style import ORANGE, axis, layout
-from tomopose.values import require_types
+from tomopose.values import Images, require_types
 
 RESIDUALS: Mapping[str, Callable[[Calibration, Joined], Figure | None]] = {
     "pose": lambda calibration, joined: residual_figures.by_pose(joined),
@@ -34,13 +35,28 @@ GREY = [[0.0, "#000000"], [1.0, "#ffffff"]]
 BLUE = "#39c0ff"
 
 
-def as_plotly(figure: Figure) -> plotly.graph_objects.Figure:
+class PlotlyFigure(Protocol):
+    """What a notebook does with a `plotly.graph_objects.Figure`, a class without types of its own."""
+
+    data: tuple[object, ...]
+    layout: object
+
+    def show(self, renderer: str | None = None) -> None: ...
+    def to_html(self, **options: object) -> str: ...
+    def write_html(self, file: str | Path, **options: object) -> None: ...
+    def write_image(self, file: str | Path, **options: object) -> None: ...
+    def update_layout(self, **changes: object) -> PlotlyFigure: ...
+    def update_traces(self, **changes: object) -> PlotlyFigure: ...
+
+
+def as_plotly(figure: Figure) -> PlotlyFigure:
     """A report's figure as one of plotly's, with its title."""
     margin = {**dict(figure.layout.get("margin", {})), "t": 64}
     title = {"text": figure.title, "x": 0.02, "y": 0.98, "yanchor": "top", "font": {"size": 15}}
-    return plotly.graph_objects.Figure(
+    made = plotly.graph_objects.Figure(
         data=list(figure.data), layout={**figure.layout, "title": title, "margin": margin, "height": figure.height}
     )
+    return cast(PlotlyFigure, made)
 
 
 def _require(value: object, kind: type, name: str, reads: str) -> None:
@@ -56,7 +72,7 @@ def plot_residuals(
     by: str = "pose",
     observations: BallObservations | None = None,
     poses: PoseSequence | None = None,
-) -> plotly.graph_objects.Figure:
+) -> PlotlyFigure:
     """Observed minus calculated ball centres, px.
 
     Parameters
@@ -82,23 +98,21 @@ def plot_residuals(
 
 
 @require_types
-def plot_scan(matrices: ProjectionMatrices) -> plotly.graph_objects.Figure:
+def plot_scan(matrices: ProjectionMatrices) -> PlotlyFigure:
     """The path of the source about the object, in W, mm (paper, fig. 9)."""
     _require(matrices, ProjectionMatrices, "matrices", "read_matrices")
     return as_plotly(scene_figures.source_path(matrices))
 
 
 @require_types
-def plot_observability(calibration: Calibration) -> plotly.graph_objects.Figure:
+def plot_observability(calibration: Calibration) -> PlotlyFigure:
     """Correlations of all estimated coordinates: what the poses can and cannot distinguish."""
     _require(calibration, Calibration, "calibration", "read_calibration")
     return as_plotly(coverage_figures.correlation_map(calibration))
 
 
 @require_types
-def plot_detections(
-    observations: BallObservations, images: Sequence[Any], *, count: int = 8
-) -> plotly.graph_objects.Figure:
+def plot_detections(observations: BallObservations, images: Images, *, count: int = 8) -> PlotlyFigure:
     """The least certain detections as pictures, with the silhouette found (orange) and the projected centre (blue).
 
     Parameters

@@ -2,9 +2,11 @@
 
 from tomopose.values.arguments import require, require_types
 from tomopose.values.held import Column, Rows, content_hash, equal, shown, table, value, verdict_html
+from tomopose.values.images import Images
 
 __all__ = [
     "Column",
+    "Images",
     "Rows",
     "content_hash",
     "equal",

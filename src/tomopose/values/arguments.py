@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError
+from tomopose.values.images import Images
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -155,8 +156,9 @@ def _test_of_one(hint: object) -> Test | None:
         return callable
     if issubclass(kind, Mapping) and len(parts) == 2:
         return _each(_test(parts[1]) or (lambda value: True), Mapping)
-    if issubclass(kind, Sequence) and parts:
-        return _may_be_numbers if parts[0] in (int, float) else _each(_test(parts[0]), Sequence)
+    if kind is Images or (issubclass(kind, Sequence) and parts):
+        item = _test(parts[0]) if parts else _may_be_numbers
+        return _may_be_numbers if parts and parts[0] in (int, float) else _each(item, Sequence)
     if kind is Iterable:  # what it holds may be made as it is asked for
         return _holds_items
     return None
@@ -172,7 +174,7 @@ def _words(hint: object) -> Iterable[str]:
         kind, inner = typing.get_origin(part) or part, typing.get_args(part)
         if kind in (int, float):
             yield "number"
-        elif kind is np.ndarray or (inner and inner[0] in (int, float)):
+        elif kind in (np.ndarray, Images) or (inner and inner[0] in (int, float)):
             yield "array of numbers"
         elif kind is CALLABLE:
             yield "function"

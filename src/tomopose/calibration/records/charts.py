@@ -6,7 +6,7 @@ alone, and what lies beyond its limits judges no other: a single bumped run cann
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,7 +124,7 @@ def _limits(value: Array, u: Array, judges: np.ndarray) -> tuple[Array, Array]:
 
 
 @require_types
-def control_chart(entries: Iterable[Entry], name: str) -> ControlChart:
+def control_chart(entries: Iterable[Mapping[str, object]], name: str) -> ControlChart:
     """The chart of a parameter ("t_HT_x", ...) or of "d_rms_px".  InputError with fewer than three entries."""
     runs = list(entries)
     found = series(runs, name)

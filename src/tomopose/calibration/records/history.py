@@ -54,7 +54,7 @@ def history_entry(calibration: Calibration, *, label: str = "", machine: str = "
 
 
 @reader("history")
-def read_history(path: str | Path) -> list[dict[str, Any]]:
+def read_history(path: str | Path) -> list[dict[str, object]]:
     """All entries, in the order written.  FileError or SchemaVersionError names the line."""
     path = Path(path)
     entries = []
@@ -103,7 +103,7 @@ def write_history(path: str | Path, entries: Sequence[Entry]) -> None:
 @require_types
 def append_history(
     path: str | Path, calibration: Calibration, *, label: str = "", machine: str = ""
-) -> list[dict[str, Any]]:
+) -> list[dict[str, object]]:
     """Add a calibration to the history file (made where absent), atomically; returns all entries.
 
     InputError, and nothing is written, where the same run is there already or the machine is another.

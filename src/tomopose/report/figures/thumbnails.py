@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +13,7 @@ from tomopose.observations import BallObservations
 from tomopose.report.figures.png import data_uri, grey_levels, grey_png
 from tomopose.report.words import number
 from tomopose.units import Array, float_array
+from tomopose.values import Images
 
 OUTLINE_POINTS = 120
 MARGIN = 0.35
@@ -113,17 +113,9 @@ def worst_first(d: ArrayLike, seen: ArrayLike) -> list[int]:
     return [int(i) for i in np.argsort(-d, kind="stable")]
 
 
-class Frames(Protocol):
-    """Images by number: a list of arrays, or an `ImageSequence`."""
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, i: int, /) -> ArrayLike: ...
-
-
 def worst_thumbnails(
     observations: BallObservations,
-    images: Frames,
+    images: Images,
     *,
     residuals: Mapping[str, float] | None = None,
     count: int = 12,

@@ -84,7 +84,7 @@ def _number(content: Any, *keys: str, default: float | None = None) -> float | N
 
 
 @require_types
-def run_from_ctsimu(content: Mapping[str, Any], *, folder: str | Path = ".", seed: int = 0) -> SimulatedRun:
+def run_from_ctsimu(content: Mapping[str, object], *, folder: str | Path = ".", seed: int = 0) -> SimulatedRun:
     """The run that a scenario's JSON content describes; files that it names are taken from `folder`.
 
     InputError for what the virtual scanner does not read, FileError for content that is no scenario.

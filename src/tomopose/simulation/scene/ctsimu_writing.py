@@ -26,7 +26,7 @@ ANODE_DENSITY = 10.0
 
 
 @require_types
-def run_to_ctsimu(run: SimulatedRun) -> tuple[dict[str, Any], dict[str, TriangleMesh]]:
+def run_to_ctsimu(run: SimulatedRun) -> tuple[dict[str, object], dict[str, TriangleMesh]]:
     """(scenario content, mesh files by name): geometry by the true poses, meshes in M, tessellated where analytic.
 
     Tube, filters and scintillator are named where the run knows them; a spectrum from a table has its highest energy

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -288,7 +288,7 @@ def read_scene(path: str | Path) -> Scene:
     return scene_from(document, where=str(path), folder=str(path.parent))
 
 
-def scene_schema() -> dict[str, Any]:
+def scene_schema() -> dict[str, object]:
     """The JSON schema of scene files."""
     schema = Scene.model_json_schema(by_alias=True)
     del schema["properties"]["folder"]
