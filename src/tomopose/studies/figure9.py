@@ -162,6 +162,8 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
                     best=found[1],
                 )
             )
+        tilt = np.degrees(as_set.tilt)
+        ends_off = float(max(abs(tilt.max() - high), abs(tilt.min() - low)))
         periods = [crossings(p.tilt) for p in both]
         rows += [
             StudyRow(
@@ -198,6 +200,9 @@ def run(scale: Scale, seed: int, steps: Steps, progress: Progress) -> tuple[Any,
                 holds=periods == [PERIODS, PERIODS],
             ),
             check_below(f"with the calibrated R_HT the tilt is the one meant ({group})", 1e3 * best, 1e-6, "mrad"),
+            check_below(
+                f"with R_z(pi) in its place the tilt's ends are the printed ones ({group})", ends_off, 0.01, "deg"
+            ),
         ]
         progress(k + 1, len(PRINTED))
     return rows, checks, figures_of(paths), NOTES

@@ -129,6 +129,11 @@ def rows_and_checks(found: Mapping[str, Mapping[str, object]]) -> tuple[list[Stu
             0.5,
             "",
         ),
+        StudyCheck(
+            statement="in the middle, where a circle is exact, the circle is the better path",
+            found=f"error {middle['circular scan']:.3g} against {middle['3D scan']:.3g}",
+            holds=middle["circular scan"] < middle["3D scan"],
+        ),
     ]
 
 
