@@ -15,6 +15,7 @@ import tomopose as tp
 from tomopose.cli.main import run
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import project_ball
+from tomopose.studies.warmup import circle
 from tomopose.trajectory.pose_grid import calibration_grid
 
 SCENE = """
@@ -34,6 +35,20 @@ u_0_px = 30.0
 v_0_px = 31.0
 n_u_px = 61
 n_v_px = 63
+"""
+PLAN = """
+schema = "tomopose/measurement-plan/1"
+unit = "mm"
+
+[features.ball]
+kind = "sphere"
+point = [0.0, 0.0, 0.0]
+radius_mm = 0.95
+
+[[measurands]]
+name = "size"
+kind = "diameter"
+of = ["ball"]
 """
 TIMES = re.compile(
     rb"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d[^\"<\s]*|[A-Z][a-z]{2} [A-Z][a-z]{2} [ \d]\d \d\d:\d\d:\d\d \d{4}"
@@ -68,6 +83,16 @@ def prepare(folder: Path) -> None:
         (folder / f"joints-{state}.csv").write_text(
             "X,Y,Z,A,B,C\n" + "".join(f"{k + state},1,2,3,4,{k}\n" for k in range(40))
         )
+        grid = tp.VoxelGrid(shape=(32, 32, 32), spacing=0.1)
+        z, y, x = np.mgrid[:32, :32, :32] - 15.5
+        ball = 1 / (1 + np.exp(2.0 * (np.sqrt(x * x + y * y + z * z) - 9.3 - state)))
+        tp.write_volume(folder / f"ball-{state}.h5", tp.Volume(values=ball.astype(np.float32), grid=grid), force=True)
+        v, u = np.mgrid[:32, :32] - 15.5
+        disc = np.where(np.hypot(u, v) < 8.0 + state, 0.5, 1.0).astype(np.float32)
+        for k in range(12):
+            tp.write_tiff(folder / f"scan-{state}" / f"view_{k:02d}.tif", disc, force=True)
+    tp.write_matrices(folder / "circle.npz", circle(12), force=True)
+    (folder / "plan.toml").write_text(PLAN)
     assert run(["simulate", str(folder / "scene-0.toml"), "--out", str(folder / "run"), "--force", "--quiet"]) == 0
 
 
@@ -104,6 +129,12 @@ def verbs(inputs: Path) -> dict[str, Callable[[Path, int], None]]:
             "import-poses", "IN/joints-STATE.csv", "--format", "csv", "--convention", "kuka", "--columns",
             "x=X,y=Y,z=Z,a=A,b=B,c=C", "--out", "OUT.csv",
         ),
+        "reconstruct": cli(
+            "reconstruct", "--matrices", "IN/circle.npz", "--images", "IN/scan-STATE", "--images-are",
+            "transmission", "--voxel-mm", "0.3", "--size", "12", "--algorithm", "sart", "--out", "OUT.h5",
+        ),
+        "measure": cli("measure", "IN/plan.toml", "--volume", "IN/ball-STATE.h5", "--out", "OUT"),
+        "study": cli("study", "figure9", "--seed", "STATE", "--out", "OUT"),
         "compare": cli("compare", "IN/cal-0/calibration.json", "IN/cal-STATE/calibration.json", "--out", "OUT.html"),
         "detect": cli(
             "detect", "--scanner", "IN/run/scanner.json", "--images", "IN/run/radiographs", "--ball-diameter-mm",
