@@ -26,6 +26,7 @@ EXPECTED = (
     "Appendix, angles",
     *(f"Table {k}" for k in range(1, 4)),
     *(f"Fig. {k}" for k in range(1, 17)),
+    *(f"Ref. [{k}]" for k in (8, 21, 22)),
 )
 
 

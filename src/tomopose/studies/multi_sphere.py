@@ -28,6 +28,7 @@ from tomopose.studies.parts.result import Progress, Scale, StudyCheck, StudyRow,
 from tomopose.studies.parts.steps import Steps
 from tomopose.studies.parts.virtual_hexapod import REPEATABILITY, ball_run, matrices_error_um, real_T_MH, scan_of
 from tomopose.studies.section6.calibrations import GRID, kinematic, planned_run, projected, rigid
+from tomopose.studies.section6.figures import lines_around
 from tomopose.studies.section6.scan import Numbers, Radiographs, Scan, scan_with
 from tomopose.studies.section6.specimen import azimuth, cylinder_areas, reference
 from tomopose.studies.section6.tables import PERIODS, deviations_of, rms, waves
@@ -44,7 +45,6 @@ CHUNK = 30
 GAIN = 10.0
 SCATTER_UM = float(1e3 * np.sqrt(2) * REPEATABILITY.t_mm)
 """Of the plate in the plane of a view; its turns add a tenth of that at 30 mm."""
-ANGLES = 120
 
 TITLE = "Fig. 12 with the multi-sphere calibration of ref. [8]"
 QUESTION = (
@@ -271,24 +271,12 @@ def checks_of(
 
 def figure_of(found: Mapping[str, Mapping[str, Any]], mesh: Mesh) -> Figure:
     """Mean deviation of the cylinder areas by direction about the axis."""
-    mine = cylinder_areas(mesh)
-    edges = np.linspace(-np.pi, np.pi, ANGLES + 1)
-    phi = azimuth(mesh)[mine]
-    data = []
-    for (name, case), colour in zip(found.items(), (ORANGE, SOFT, ALERT, ACCENT), strict=True):
-        d = deviations_of(case)[mine]
-        good = np.isfinite(d)
-        total, count = (np.histogram(phi[good], edges, weights=w)[0] for w in (d[good], None))
-        with np.errstate(invalid="ignore"):
-            mean = total / count
-        data.append({
-            "type": "scatter", "mode": "lines", "name": name, "x": np.degrees((edges[:-1] + edges[1:]) / 2),
-            "y": [None if np.isnan(v) else float(v) for v in mean], "line": {"color": colour, "width": 1.6},
-        })  # fmt: skip
+    colours = (ORANGE, SOFT, ALERT, ACCENT)
+    cases = {name: (deviations_of(case), c) for (name, case), c in zip(found.items(), colours, strict=True)}
     return Figure(
         title="Cylinder areas by direction",
         meaning="Measured surface minus the specimen as made, mean over height, um.",
         look_for="Seven waves by the paper's method alone.",
-        data=data,
+        data=lines_around(mesh, cases),
         layout=layout(xaxis=axis("direction / deg"), yaxis=axis("deviation / um")),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from tomopose.studies.section6.scan import Numbers
 from tomopose.studies.section6.specimen import azimuth, cylinder_areas
 from tomopose.studies.section6.standard import true_distances
 from tomopose.studies.section6.tables import Found, deviations, limit
+from tomopose.units import Array
 
 RANGE_UM = 50.0
 """Where the colours of deviations are clipped; the paper clips at 25 um, at voxels of 0.0756 mm."""
@@ -134,28 +136,36 @@ def unrolled(found: Found, mesh: Mesh) -> Figure:
     )
 
 
-def around(found: Found, mesh: Mesh) -> Figure:
-    """Fig. 12: deviation of the cylinder areas by direction about the rotation axis."""
+def lines_around(mesh: Mesh, cases: Mapping[str, tuple[Array, str]]) -> list[dict[str, object]]:
+    """A line for each case, name -> (deviations of the mesh's vertices, um; colour): mean over the height of the
+    cylinder areas by direction about the rotation axis."""
     chosen = cylinder_areas(mesh)
     phi = np.degrees(azimuth(mesh)[chosen]) % 360
     cell = np.minimum(phi / 360 * ANGLES, ANGLES - 1).astype(int)  # -1e-20 % 360 is 360
-    data = []
-    for name, case in panels("specimen").items():
-        d = deviations(found, case)[chosen]
+    lines: list[dict[str, object]] = []
+    for name, (deviation, colour) in cases.items():
+        d = deviation[chosen]
         good = np.isfinite(d)
         count = np.bincount(cell[good], minlength=ANGLES)
         with np.errstate(invalid="ignore"):
             mean = np.bincount(cell[good], d[good], minlength=ANGLES) / count
-        data.append(
+        lines.append(
             {
                 "type": "scatter",
                 "mode": "lines",
                 "name": name,
                 "x": 360 * (np.arange(ANGLES) + 0.5) / ANGLES,
                 "y": [None if np.isnan(m) else float(m) for m in mean],
-                "line": {"color": COLOURS[name], "width": 1.8},
+                "line": {"color": colour, "width": 1.8},
             }
         )
+    return lines
+
+
+def around(found: Found, mesh: Mesh) -> Figure:
+    """Fig. 12: deviation of the cylinder areas by direction about the rotation axis."""
+    cases = {name: (deviations(found, case), COLOURS[name]) for name, case in panels("specimen").items()}
+    data = lines_around(mesh, cases)
     return Figure(
         title="Fig. 12: deviation around the rotation axis",
         meaning="Mean over the cylinder areas, by the direction of the surface's normal.",
