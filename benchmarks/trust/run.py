@@ -21,7 +21,7 @@ from robot_camera import described, study
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from tomopose.calibration.checks.convention_tests import ranked
+from tomopose.calibration.checks.conventions.diagnose import ranked
 from tomopose.calibration.model.covariance import inverse_information
 from tomopose.calibration.model.parameters import free_parameters
 from tomopose.calibration.model.problem import Problem, pair

@@ -17,11 +17,11 @@ from .calibration.arrangements.turntable import diagnose_turntable as diagnose_t
 from .calibration.arrangements.twin_diagnosis import diagnose_twin as diagnose_twin
 from .calibration.arrangements.twin_robots import calibrate_twin as calibrate_twin
 from .calibration.arrangements.twin_robots import twin_matrices as twin_matrices
-from .calibration.checks.alternative import Alternative as Alternative
-from .calibration.checks.convention_tests import Diagnosis as Diagnosis
-from .calibration.checks.convention_tests import Hypothesis as Hypothesis
-from .calibration.checks.convention_tests import diagnose as diagnose
-from .calibration.checks.scanner_tests import Explanation as Explanation
+from .calibration.checks.conventions.alternative import Alternative as Alternative
+from .calibration.checks.conventions.diagnose import diagnose as diagnose
+from .calibration.checks.conventions.hypothesis import Diagnosis as Diagnosis
+from .calibration.checks.conventions.hypothesis import Hypothesis as Hypothesis
+from .calibration.checks.score_tests.ranking import Explanation as Explanation
 from .calibration.checks.stability import Effect as Effect
 from .calibration.checks.stability import OutlierBlock as OutlierBlock
 from .calibration.checks.stability import RepeatedPose as RepeatedPose

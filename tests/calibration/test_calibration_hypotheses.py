@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from calibration_cases import BALL, MOUNT, SCANNER, mixed_poses, observe, paper_poses
 
-from tomopose.calibration.checks.convention_tests import diagnose
-from tomopose.calibration.checks.conventions import ALTERNATIVES
+from tomopose.calibration.checks.conventions.alternatives import ALTERNATIVES
+from tomopose.calibration.checks.conventions.diagnose import diagnose
 from tomopose.calibration.model.problem import pair
 from tomopose.calibration.solve import calibrate
 from tomopose.geometry.frames import Frame

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tomopose.calibration.checks.convention_tests import FITS_SIGMAS, diagnose
+from tomopose.calibration.checks.conventions.diagnose import diagnose
+from tomopose.calibration.checks.conventions.hypothesis import FITS_SIGMAS
 from tomopose.calibration.model.problem import pair
 from tomopose.calibration.model.silhouettes import chain_matrices, silhouette_outlines
 from tomopose.calibration.solve import calibrate

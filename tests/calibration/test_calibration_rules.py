@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tomopose.calibration.checks.convention_tests import Diagnosis, Hypothesis
+from tomopose.calibration.checks.conventions.hypothesis import Diagnosis, Hypothesis
 from tomopose.calibration.checks.evidence.evidence import (
     AgainstRigid,
     BallSize,
@@ -19,7 +19,8 @@ from tomopose.calibration.checks.evidence.evidence import (
     Undistinguished,
 )
 from tomopose.calibration.checks.rules import ARRANGEMENTS, MODELS, RULES, findings, rules_table
-from tomopose.calibration.checks.scanner_tests import Explanation, Ranked, ScannerTests, Single
+from tomopose.calibration.checks.score_tests.ranking import Explanation, Ranked, Single
+from tomopose.calibration.checks.score_tests.scanner_tests import ScannerTests
 from tomopose.calibration.checks.stability import Effect, OutlierBlock, RepeatedPose, Stability
 from tomopose.calibration.checks.verdict import VERDICTS, Finding, judge
 from tomopose.calibration.model.budget import Halves

@@ -12,7 +12,7 @@ import pytest
 
 from tomopose import Calibration, PoseSequence, ProjectionMatrices
 from tomopose.calibration.arrangements.twin_robots import twin_matrices
-from tomopose.calibration.checks.convention_tests import Hypothesis
+from tomopose.calibration.checks.conventions.hypothesis import Hypothesis
 from tomopose.calibration.checks.stability import Effect, OutlierBlock, RepeatedPose, Stability
 from tomopose.calibration.checks.verdict import Finding
 from tomopose.calibration.projection_matrices import projection_matrices

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tomopose import BallObservations, Calibration, PoseSequence, ProjectionMatrices, RigidTransform, Scanner
-from tomopose.calibration.checks.convention_tests import Hypothesis
+from tomopose.calibration.checks.conventions.hypothesis import Hypothesis
 from tomopose.calibration.checks.verdict import Finding
 from tomopose.calibration.result import Observability, Parameter
 from tomopose.geometry.frames import Frame

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tomopose.calibration.checks.ball_size import measured_ball_size, require_ball_size
-from tomopose.calibration.checks.convention_tests import Diagnosis
+from tomopose.calibration.checks.conventions.hypothesis import Diagnosis
 from tomopose.calibration.checks.evidence.evidence import (
     AgainstRigid,
     BallSize,
@@ -17,7 +17,7 @@ from tomopose.calibration.checks.evidence.evidence import (
     Undistinguished,
 )
 from tomopose.calibration.checks.rules import findings
-from tomopose.calibration.checks.scanner_tests import ScannerTests
+from tomopose.calibration.checks.score_tests.scanner_tests import ScannerTests
 from tomopose.calibration.checks.stability import stability
 from tomopose.calibration.model.assumed import Assumed
 from tomopose.calibration.model.covariance import angles_by_tangent

@@ -8,8 +8,8 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from tomopose.calibration.checks.convention_tests import Hypothesis
-from tomopose.calibration.checks.scanner_tests import Explanation
+from tomopose.calibration.checks.conventions.hypothesis import Hypothesis
+from tomopose.calibration.checks.score_tests.ranking import Explanation
 from tomopose.calibration.checks.stability import Stability
 from tomopose.calibration.checks.verdict import Finding, Verdict, judge
 from tomopose.calibration.model.assumed import Assumed

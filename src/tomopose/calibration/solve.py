@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from tomopose.calibration.build import Fitted, build, expected_px, magnification_at_balls
-from tomopose.calibration.checks.alternative import Alternative
-from tomopose.calibration.checks.convention_tests import Diagnosis, ranked, set_pose_alternative
-from tomopose.calibration.checks.conventions import ALTERNATIVES
+from tomopose.calibration.checks.conventions.alternative import Alternative
+from tomopose.calibration.checks.conventions.alternatives import ALTERNATIVES
+from tomopose.calibration.checks.conventions.diagnose import ranked, set_pose_alternative
+from tomopose.calibration.checks.conventions.hypothesis import Diagnosis
 from tomopose.calibration.checks.evidence.evidence import Undistinguished
 from tomopose.calibration.checks.evidence.undistinguished import undistinguished_readings
 from tomopose.calibration.checks.placement import require_on_panel
-from tomopose.calibration.checks.scanner_tests import ScannerTests, rows_to_test, scanner_tests
+from tomopose.calibration.checks.score_tests.scanner_tests import ScannerTests, rows_to_test, scanner_tests
 from tomopose.calibration.model.assumed import Assumed, scatter_assumed, taken_as_known, without_effect
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS
 from tomopose.calibration.model.covariance import inverse_information, widening
@@ -34,7 +35,7 @@ from tomopose.calibration.model.unseen import Unseen, unseen_of
 from tomopose.calibration.result import Arrangement, Calibration, PoseNoiseFound
 from tomopose.calibration.rigid.contradiction import NOTHING_FITS, Contradicted, as_stated, contradicted
 from tomopose.calibration.rigid.estimate import Solution, solve, with_pose_noise
-from tomopose.calibration.rigid.fit import blocks, linear_fit
+from tomopose.calibration.rigid.fit import blocks
 from tomopose.calibration.rigid.observability import observability
 from tomopose.errors import InputError, NotConvergedError, NotObservableError
 from tomopose.geometry.scanner import Scanner
@@ -62,7 +63,7 @@ def assumed_names(free: FreeParameters) -> tuple[str, ...]:
 def assumed_jacobian(solution: Solution, names: tuple[str, ...]) -> Array:
     """(n, 2, a): derivatives of the calculated centres by parameters that were held, px."""
     p = solution.used
-    J_s = blocks(p, solution.free, solution.fit).J_scanner
+    J_s = solution.at.J_scanner
     columns = [SCANNER_COLUMNS.index("p_u" if n == "pitch_ratio" else n) for n in names]
     factor = np.array([p.scanner.p_v if n == "pitch_ratio" else 1.0 for n in names])
     result: Array = J_s[:, :, columns] * factor
@@ -99,7 +100,7 @@ def _rigid(
             chi2_dof_without=chi2 / solution.dof,
             found=solution.noise.found,
         )
-    linear = linear_fit(p, free, fit)
+    linear = solution.linear
     scanners = adjusted_scanners(p.scanners, free, fit.delta)
     scale = translation_scale(free, fit.delta)
     return build(
@@ -125,7 +126,7 @@ def _rigid(
             status=(f"optimum of {len(p)} poses reached" if fit.converged else fit.status.value),
             misfit=stated.robust.misfit,
             expected_px=expected_px(linear),
-            stated_px=expected_px(linear_fit(stated.used, free, stated.fit)),
+            stated_px=expected_px(stated.linear),
             model="rigid",
             arrangement=arrangement,
             errors=RigidErrors(translation_scale=scale, scatter=scatter),
@@ -164,10 +165,11 @@ def _tests(solution: Solution) -> ScannerTests | None:
     if not solution.fit.converged or solution.chi2 > NOTHING_FITS * 2 * len(solution.used):
         return None
     rows = np.flatnonzero(rows_to_test(solution.robust.keep))
-    problem = solution.problem.select(rows)
+    problem = solution.used if len(rows) == len(solution.used) else solution.problem.select(rows)
     if 2 * len(problem) < solution.J.shape[2] + FEWEST_TESTED:
         return None
-    return scanner_tests(problem, solution.free, solution.fit)
+    at = solution.at if problem is solution.used else blocks(problem, solution.free, solution.fit)
+    return scanner_tests(problem, solution.free, solution.fit, at)
 
 
 FEWEST_TESTED = 10
@@ -178,7 +180,7 @@ def _unseen(solution: Solution, linear: LinearFit, *, moving_scanner: bool, exac
     """What no ball shows of table and manipulator, and how the estimate answers to it."""
     p, fit = solution.used, solution.fit
     return unseen_of(
-        blocks(p, solution.free, fit),
+        solution.at,
         inverse_information(fit.N),
         linear.J,
         linear.C,

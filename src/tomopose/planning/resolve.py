@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tomopose.calibration.checks.convention_tests import BETTER, Diagnosis, Hypothesis, ranked
-from tomopose.calibration.checks.conventions import ALTERNATIVES
+from tomopose.calibration.checks.conventions.alternatives import ALTERNATIVES
+from tomopose.calibration.checks.conventions.diagnose import ranked
+from tomopose.calibration.checks.conventions.hypothesis import BETTER, Diagnosis, Hypothesis
 from tomopose.calibration.model.parameters import UNITS, free_parameters
 from tomopose.calibration.model.problem import Problem, pair
 from tomopose.calibration.rigid.estimate import best_fit

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tomopose.calibration.checks.conventions import ALTERNATIVES_OF_MOVING_SCANNER
+from tomopose.calibration.checks.conventions.alternatives import ALTERNATIVES_OF_MOVING_SCANNER
 from tomopose.calibration.identified.calibrate import calibrate_kinematic, machine_of
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.result import Calibration, ViewDistances

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from tomopose.calibration.build import magnification_at_balls
-from tomopose.calibration.checks.convention_tests import Diagnosis, Hypothesis, compared, rank
-from tomopose.calibration.checks.conventions import ALTERNATIVES
+from tomopose.calibration.checks.conventions.alternatives import ALTERNATIVES
+from tomopose.calibration.checks.conventions.hypothesis import Diagnosis, Hypothesis, compared, rank
 from tomopose.calibration.checks.placement import require_on_panel
 from tomopose.calibration.identified.calibrate import known_bars, pose_rows
 from tomopose.calibration.identified.fit import ModelFit, fit_model

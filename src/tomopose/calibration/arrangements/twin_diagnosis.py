@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from tomopose.calibration.arrangements.twin_robots import trusted_problem
-from tomopose.calibration.checks.alternative import Alternative
-from tomopose.calibration.checks.convention_tests import Diagnosis, compared, rank
-from tomopose.calibration.checks.conventions import ALTERNATIVES
+from tomopose.calibration.checks.conventions.alternative import Alternative
+from tomopose.calibration.checks.conventions.alternatives import ALTERNATIVES
+from tomopose.calibration.checks.conventions.hypothesis import Diagnosis, compared, rank
 from tomopose.calibration.identified.hypothesis import hypothesis_of
 from tomopose.calibration.identified.map_estimate import STEPS, MapEstimate, solve_map
 from tomopose.calibration.model.problem import Problem, pair

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tomopose.calibration.checks.convention_tests import BETTER, MUCH_BETTER
+from tomopose.calibration.checks.conventions.hypothesis import BETTER, MUCH_BETTER
 from tomopose.calibration.checks.evidence import culprits, measures
 from tomopose.calibration.checks.evidence.evidence import MISFIT_CHI2, Evidence
 from tomopose.calibration.checks.evidence.measures import (
@@ -22,7 +22,7 @@ from tomopose.calibration.checks.evidence.measures import (
     REPEAT_PX,
     Found,
 )
-from tomopose.calibration.checks.scanner_tests import DECISIVE
+from tomopose.calibration.checks.score_tests.ranking import DECISIVE
 from tomopose.calibration.checks.stability import SIGNIFICANT
 from tomopose.calibration.checks.verdict import Finding, Verdict
 from tomopose.calibration.model.covariance import WIDENING_PROBABILITY

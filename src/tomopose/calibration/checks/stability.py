@@ -8,7 +8,6 @@ an F test against what it leaves.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from datetime import datetime
 from math import comb
 
 import numpy as np
@@ -16,9 +15,10 @@ import numpy.typing as npt
 from scipy.special import fdtrc
 
 from tomopose.calibration.checks.cross_validation import held_out
+from tomopose.calibration.checks.score_tests.score import Beside, best_step, in_pixels, step_at
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters
-from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.model.problem import Problem, elapsed
 from tomopose.calibration.rigid.fit import Fit, linear_fit
 from tomopose.geometry.extent import largest_distance
 from tomopose.geometry.rotations import rotation_angle_between
@@ -86,52 +86,42 @@ class Stability:
         return tuple(e for e in self.effects if e.p < SIGNIFICANT)
 
 
-def elapsed(problem: Problem) -> Array:
-    """(n,) time since the first image, s; the place in the sequence where no times are known."""
-    if problem.time_utc is not None:
-        try:
-            t = np.array([datetime.fromisoformat(s).timestamp() for s in problem.time_utc])
-        except ValueError:
-            t = np.zeros(0)
-        if t.size and np.ptp(t) > 0:
-            result: Array = t - t.min()
-            return result
-    return np.arange(len(problem), dtype=np.float64)
-
-
-def _without(C: Array, A: Array) -> Array:
-    """What of the columns C (k, c) the columns A (k, a) cannot follow."""
-    A = A / np.maximum(np.linalg.norm(A, axis=0), 1e-300)
-    return np.asarray(C - A @ np.linalg.lstsq(A, C, rcond=1e-10)[0], dtype=np.float64)
-
-
-def drift(fit: LinearFit, columns: Array, *, name: str, words: str, unit: tuple[float, str]) -> Effect:
+def drift(fit: LinearFit, beside: Beside, columns: Array, *, name: str, words: str, unit: tuple[float, str]) -> Effect:
     """A slow change of the coordinates behind `columns` (n, 2, c), whitened derivatives: cubic in time, about a
     constant that is free.
 
-    words: with {} for the largest distance between two moments of the run, given in unit (factor, name).
+    beside: the rows of the fit;  words: with {} for the largest distance between two moments of the run, given in unit
+    (factor, name).
     """
     c = columns.shape[2]
     tau = elapsed(fit.problem)
     course = np.polynomial.legendre.legvander(2.0 * tau / np.ptp(tau) - 1.0, DRIFT_ORDER)[:, 1:]
     moved = (columns[:, :, None, :] * course[:, None, :, None]).reshape(len(columns), 2, DRIFT_ORDER * c)
-    C, known = fit.with_priors(moved), np.concatenate([fit.rows, fit.with_priors(columns)], axis=1)
-    rest = _without(fit.residuals[:, None], known)
-    move = np.linalg.lstsq(_without(C, known), rest, rcond=1e-8)[0].ravel()
-    after = _without(rest, np.concatenate([known, C], axis=1))
-    before, left = float((rest**2).sum()), float((after**2).sum())
-    gain = before - left
-    path = course @ move.reshape(DRIFT_ORDER, c)
-    reach = largest_distance(path)
+    constant = _new_directions(beside.without(columns.reshape(-1, c)), columns)
+    rest = beside.rest - constant @ (constant.T @ beside.rest)
+    C = beside.without(moved.reshape(-1, DRIFT_ORDER * c))
+    U, s, Vt = np.linalg.svd(C - constant @ (constant.T @ C), full_matrices=False)
+    seen = s > 1e-8 * s[0]
+    along = U[:, seen].T @ rest
+    move = Vt[seen].T @ (along / s[seen])
+    before, gain = float(rest @ rest), float(along @ along)
+    reach = largest_distance(course @ move.reshape(DRIFT_ORDER, c))
     size = _size_px(fit, moved @ move)
     factor, symbol = unit
+    known = fit.rows.shape[1] + c
     return Effect(
         name=name,
-        p=_p(gain, C.shape[1], left, len(rest) - known.shape[1] - C.shape[1]),
+        p=_p(gain, len(move), before - gain, len(rest) - known - len(move)),
         size_px=size,
         share=gain / max(before, 1e-300),
         words=f"{words.format(f'{reach * factor:.2g} {symbol}')} over the run, {size:.2g} px rms",
     )
+
+
+def _new_directions(left: Array, columns: Array) -> Array:
+    """(k, q): an orthonormal basis of what is left (k, c) of columns (n, 2, c) beside a fit that may hold them."""
+    U, s, _ = np.linalg.svd(left / np.maximum(np.linalg.norm(columns, axis=(0, 1)), 1e-300), full_matrices=False)
+    return np.asarray(U[:, s > 1e-9])
 
 
 def _p(gain: float, c: int, left: float, dof: int) -> float:
@@ -142,12 +132,11 @@ def _p(gain: float, c: int, left: float, dof: int) -> float:
     return float(fdtrc(c, dof, max(gain, 0.0) / c / max(left / dof, 1e-300)))
 
 
-def _size_px(fit: LinearFit, whitened: Array) -> float:
-    px = np.linalg.solve(fit.W, whitened[:, :, None])[..., 0]
-    return float(np.sqrt((px**2).sum(axis=1).mean()))
+def _size_px(fit: LinearFit, moved: Array) -> float:
+    return float(np.sqrt((in_pixels(fit.W, moved) ** 2).sum(axis=1).mean()))
 
 
-def change_point(fit: LinearFit, columns: Array, *, name: str, words: str) -> Effect | None:
+def change_point(fit: LinearFit, beside: Beside, columns: Array, *, name: str, words: str) -> Effect | None:
     """The place where a sudden change of the coordinates behind `columns` (n, 2, c) explains most of chi2.
 
     Every place with at least c poses on both sides is tried; p counts all of them (Bonferroni).
@@ -155,30 +144,12 @@ def change_point(fit: LinearFit, columns: Array, *, name: str, words: str) -> Ef
     n, c = len(fit.problem), columns.shape[2]
     if n < 4 * c:
         return None
-    known = np.linalg.qr(fit.rows / np.maximum(np.linalg.norm(fit.rows, axis=0), 1e-300))[0]
-    rest = fit.residuals - known @ (known.T @ fit.residuals)
-    Q, rw = known[: 2 * n].reshape(n, 2, -1), rest[: 2 * n].reshape(n, 2)
-
-    def after(x: Array) -> Array:
-        return np.cumsum(x[::-1], axis=0)[::-1]
-
-    A = after(np.einsum("kia,kib->kab", columns, columns))
-    B = after(np.einsum("kiq,kia->kqa", Q, columns))
-    g = after(np.einsum("kia,ki->ka", columns, rw))
-    M = A - np.swapaxes(B, 1, 2) @ B
     places = np.arange(c, n - c)
-    d = np.sqrt(np.maximum(np.einsum("kaa->ka", A), 1e-300))
-    Ms = M / d[:, :, None] / d[:, None, :]
-    value, V = np.linalg.eigh(Ms[places])
-    z = np.einsum("kab,ka->kb", V, g[places] / d[places])
-    seen = value > 1e-6
-    gain = (np.where(seen, z**2 / np.where(seen, value, 1.0), 0.0)).sum(axis=1)
-    k = int(places[gain.argmax()])
-    step = np.linalg.lstsq(M[k], g[k], rcond=1e-8)[0]
+    k, best, _ = best_step(columns, beside, places)
+    step = step_at(columns, beside, k)
     late = columns * (np.arange(n) >= k)[:, None, None]
-    size = _size_px(fit, late @ step)
-    best, before = float(gain.max()), float((rest**2).sum())
-    p = _p(best, c, before - best, len(rest) - fit.J.shape[2] - c)
+    size, before = _size_px(fit, late @ step), beside.chi2
+    p = _p(best, c, before - best, len(beside.rest) - fit.J.shape[2] - c)
     return Effect(
         name=name,
         p=min(1.0, p * len(places)),
@@ -237,11 +208,18 @@ def outlier_block(pose_id: tuple[str, ...], keep: npt.NDArray[np.bool_]) -> Outl
 
 def movements_of(fit: LinearFit, R_HT: Array) -> tuple[Effect, ...]:
     """Drifts and change points, significant or not.  R_HT (3, 3): rotation of the mount."""
-    W = fit.W
+    W, beside = fit.W, Beside.of(fit.rows, fit.residuals)
     found = [
-        drift(fit, W @ fit.J_t_HT, name="drift", words="the ball drifts by {}", unit=(1000.0, "um")),
-        drift(fit, W, name="image drift", words="the images drift by {} (focal spot or detector)", unit=(1.0, "px")),
-        *(change_point(fit, W @ J, name=name, words=words) for name, words, J in _steps(fit, R_HT)),
+        drift(fit, beside, W @ fit.J_t_HT, name="drift", words="the ball drifts by {}", unit=(1000.0, "um")),
+        drift(
+            fit,
+            beside,
+            W,
+            name="image drift",
+            words="the images drift by {} (focal spot or detector)",
+            unit=(1.0, "px"),
+        ),
+        *(change_point(fit, beside, W @ J, name=name, words=words) for name, words, J in _steps(fit, R_HT)),
     ]
     return tuple(e for e in found if e is not None)
 
@@ -277,8 +255,8 @@ def chi2_with_movements(problem: Problem, free: FreeParameters, fit: Fit, moved:
             columns.append((at.W @ (steps[e.name] * late[:, None, None])).reshape(2 * n, -1))
         else:
             columns += [(at.W * (tau**k)[:, None, None]).reshape(2 * n, -1) for k in range(DRIFT_ORDER + 1)]
-    rest = _without(at.r_white.reshape(-1, 1), np.concatenate(columns, axis=1))
-    return float((rest**2).sum() + (free.information * fit.delta**2).sum())
+    rest = Beside.of(np.concatenate(columns, axis=1), at.r_white.ravel())
+    return float(rest.chi2 + (free.information * fit.delta**2).sum())
 
 
 def stability(fit: LinearFit, R_HT: Array, everything: Problem, keep: npt.NDArray[np.bool_]) -> Stability:

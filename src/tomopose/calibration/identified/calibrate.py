@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tomopose.calibration.checks.convention_tests import Diagnosis
+from tomopose.calibration.checks.conventions.hypothesis import Diagnosis
 from tomopose.calibration.identified.fit import ModelFit, fit_model
 from tomopose.calibration.identified.geometry_prior import averaged
 from tomopose.calibration.identified.map_estimate import KinematicProblem, State

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tomopose.calibration.checks.convention_tests import Hypothesis
+from tomopose.calibration.checks.conventions.hypothesis import Hypothesis
 from tomopose.calibration.identified.map_estimate import MapEstimate, linear_at
 
 

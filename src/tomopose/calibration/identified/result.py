@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from tomopose.calibration.build import Fitted, ManipulatorEvidence, build, expected_px
-from tomopose.calibration.checks.convention_tests import Diagnosis
+from tomopose.calibration.checks.conventions.hypothesis import Diagnosis
 from tomopose.calibration.checks.evidence.evidence import RAISED_SCATTER, AgainstRigid, ScatterFound
-from tomopose.calibration.checks.evidence.fit_tests import score_tests
 from tomopose.calibration.checks.evidence.measures import EFFECT_SHARE
-from tomopose.calibration.checks.scanner_tests import ScannerTests, rows_to_test
+from tomopose.calibration.checks.score_tests.fit_tests import score_tests
+from tomopose.calibration.checks.score_tests.scanner_tests import ScannerTests, rows_to_test
 from tomopose.calibration.identified.fit import ModelFit
 from tomopose.calibration.identified.map_estimate import blocks_of, linear_at, linear_fit, linearise, singular_values
 from tomopose.calibration.identified.model_selection import better, by_rotation

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -90,7 +91,10 @@ class Problem:
 
     def select(self, keep: Any) -> Problem:
         """The observations with those indices (or that mask)."""
-        k = np.arange(len(self))[np.asarray(keep)]
+        keep = np.asarray(keep)
+        if keep.dtype == bool and keep.all():
+            return self
+        k = np.arange(len(self))[keep]
         rows: dict[str, Any] = {
             name: np.ascontiguousarray(getattr(self, name)[k])
             for name in ("R_MH", "t_MH", "alpha", "run", "index", "ball", "x_D", "covariance", "W")
@@ -107,6 +111,18 @@ class Problem:
     def with_covariance(self, covariance: Array) -> Problem:
         """The same centres with other covariances (n, 2, 2)."""
         return replace(self, covariance=covariance, W=whiteners(covariance))
+
+
+def elapsed(problem: Problem) -> Array:
+    """(n,) time since the first image, s; the place in the sequence where no times are known."""
+    if problem.time_utc is not None:
+        try:
+            t = np.array([datetime.fromisoformat(s).timestamp() for s in problem.time_utc])
+        except ValueError:
+            t = np.zeros(0)
+        if t.size and np.ptp(t) > 0:
+            return np.asarray(t - t.min())
+    return np.arange(len(problem), dtype=np.float64)
 
 
 def rotated(problem: Problem, R: Array) -> Problem:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from tomopose.calibration.model.ball_projection import ProjectionBlocks
 from tomopose.calibration.model.covariance import inverse_information, significant, widening
+from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import UNITS, FreeParameters, free_parameters
 from tomopose.calibration.model.problem import POSITION_UNITS, Problem
 from tomopose.calibration.rigid.fit import (
     Fit,
     blocks,
     jacobian,
+    linearised,
     minimise,
     residuals,
     tangent_names,
@@ -128,7 +132,7 @@ def require_length(problem: Problem, fit: Fit) -> None:
 class Solution:
     """A robust fit with all that the later steps need.
 
-    problem, used: all rows, and those not set aside;  J: (used, 2, m) px;  x_calc: (used, 2) px.
+    problem, used: all rows, and those not set aside;  J: (used, 2, m) px;  at: projection of the rows used.
     chi2: by the covariances that were used;  covariance: (m, m), widened by the rule in `uncertainty`.
     noise: the pose noise that the covariances include, or None.
     """
@@ -139,7 +143,7 @@ class Solution:
     free: FreeParameters
     robust: RobustFit
     J: Array
-    x_calc: Array
+    at: ProjectionBlocks
     chi2: float
     dof: int
     covariance: Array
@@ -147,6 +151,20 @@ class Solution:
     @property
     def fit(self) -> Fit:
         return self.robust.fit
+
+    @property
+    def x_calc(self) -> Array:
+        """(used, 2) px."""
+        return self.at.x_D
+
+    @cached_property
+    def linear(self) -> LinearFit:
+        """The fit of the rows used, as the checks look at it."""
+        return linearised(self.used, self.free, self.fit, self.at, self.J)
+
+    def at_all_rows(self) -> ProjectionBlocks:
+        """Projection of all rows, those set aside included."""
+        return self.at if self.used is self.problem else blocks(self.problem, self.free, self.fit)
 
 
 def solve(
@@ -163,17 +181,20 @@ def solve(
         raise NotConvergedError("no start led to an optimum with the ball in front of the source in every pose")
     require_length(problem, first)
     everything = np.ones(len(problem), dtype=bool)
+    b = blocks(problem, free, first)
+    J = jacobian(problem, free, b)
     # judged by detection noise alone: pose noise as large as a mistake would hide behind "not observable"
     if noise is None:
-        require_observable(problem, free, jacobian(problem, free, blocks(problem, free, first)))
+        require_observable(problem, free, J)
     result = (
-        robust_fit(problem, free, first)
+        robust_fit(problem, free, first, b.x_D, J)
         if robust
         else RobustFit(fit=first, keep=everything, distance2=np.full(len(problem), np.nan), scale=np.nan, misfit=False)
     )
     used = problem.select(result.keep)
-    b = blocks(used, free, result.fit)
-    J = jacobian(used, free, b)
+    if result.fit is not first or used is not problem:
+        b = blocks(used, free, result.fit)
+        J = jacobian(used, free, b)
     if noise is None and not result.keep.all():
         require_observable(used, free, J)
     dof = 2 * len(used) + int((free.information > 0).sum()) - J.shape[2]
@@ -187,7 +208,7 @@ def solve(
         free=free,
         robust=result,
         J=J,
-        x_calc=b.x_D,
+        at=b,
         chi2=chi2,
         dof=dof,
         covariance=inverse_information(result.fit.N) * widening(chi2, dof),
@@ -231,16 +252,14 @@ def with_pose_noise(
         noise = _posterior(original.select(solution.robust.keep), solution, maker) if given is None else given
         if noise.translation == noise.rotation == 0.0:
             return solution
-        everywhere = blocks(original, free, solution.fit)
-        problem = original.with_covariance(total_covariance(original.covariance, everywhere, noise))
+        V = total_covariance(original.covariance, solution.at_all_rows(), noise)
+        problem = original.with_covariance(V)
         solution = solve(problem, free, robust=robust, start=solution.fit, noise=noise)
     return solution
 
 
 def _posterior(used: Problem, solution: Solution, maker: Repeatability | None) -> PoseNoise:
-    free = solution.free
-    at = blocks(used, free, solution.fit)
-    J = jacobian(used, free, at)
+    free, at, J = solution.free, solution.at, solution.J
     known = np.zeros(J.shape[2] - len(free))
     return estimate_pose_noise(
         used.covariance,

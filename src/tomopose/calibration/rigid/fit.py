@@ -80,8 +80,16 @@ def minimise(
     N = np.zeros((m, m))
     at = Point(R, t_HT, t, delta)
     chi2, code = levenberg_marquardt(rows_of(problem, weight), freed_of(problem, free), at, iterations, N)
-    U, _, V = np.linalg.svd(R)
-    return Fit(R_HT=U @ V, t_HT=t_HT, t=t, delta=delta, chi2=float(chi2), status=CODES[code], N=N)
+    # the rounding of many steps, taken off R: the nearest rotation, to second order in its distance
+    return Fit(
+        R_HT=R @ (1.5 * np.eye(3) - 0.5 * (R.T @ R)),
+        t_HT=t_HT,
+        t=t,
+        delta=delta,
+        chi2=float(chi2),
+        status=CODES[code],
+        N=N,
+    )
 
 
 def residuals(problem: Problem, free: FreeParameters, fit: Fit) -> Array:
@@ -125,7 +133,11 @@ def jacobian(problem: Problem, free: FreeParameters, b: ProjectionBlocks) -> Arr
 def linear_fit(problem: Problem, free: FreeParameters, fit: Fit) -> LinearFit:
     """The fit with its residuals, derivatives and priors, as the checks look at it."""
     b = blocks(problem, free, fit)
-    J = jacobian(problem, free, b)
+    return linearised(problem, free, fit, b, jacobian(problem, free, b))
+
+
+def linearised(problem: Problem, free: FreeParameters, fit: Fit, b: ProjectionBlocks, J: Array) -> LinearFit:
+    """The same of a fit whose projection b and derivatives J (n, 2, m) are known."""
     m, stated = J.shape[2], np.flatnonzero(free.information > 0)
     root = np.sqrt(free.information[stated])
     rows = np.zeros((len(stated), m))

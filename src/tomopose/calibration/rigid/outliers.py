@@ -60,11 +60,12 @@ def limit_beside(found: Array, n: int) -> float:
     return min(limit(n), 2.0 * s / (s - 1.0) * math.log(s * (1.0 - p) / p))
 
 
-def studentised(problem: Problem, free: FreeParameters, fit: Fit, keep: npt.NDArray[np.bool_]) -> Array:
-    """(n,) squared residuals in their own predicted standard deviations.  Rows not kept count as predictions."""
-    b = blocks(problem, free, fit)
-    J = jacobian(problem, free, b)
-    r = problem.x_D - b.x_D
+def studentised(problem: Problem, fit: Fit, keep: npt.NDArray[np.bool_], x_calc: Array, J: Array) -> Array:
+    """(n,) squared residuals in their own predicted standard deviations.  Rows not kept count as predictions.
+
+    x_calc (n, 2) px and J (n, 2, m): calculated centres and their derivatives at the fit.
+    """
+    r = problem.x_D - x_calc
     spread = J @ inverse_information(fit.N) @ np.swapaxes(J, 1, 2)
     V = problem.covariance + np.where(keep[:, None, None], -spread, spread)
     # a row that the fit follows entirely has no residual of its own: floor at one per cent of its covariance
@@ -78,11 +79,12 @@ def _scale(distance2: Array) -> float:
     return float(np.median(distance2) / MEDIAN_CHI2_2)
 
 
-def robust_fit(problem: Problem, free: FreeParameters, start: Fit) -> RobustFit:
-    """The fit without the rows that do not belong, from the ordinary fit `start`."""
+def robust_fit(problem: Problem, free: FreeParameters, start: Fit, x_calc: Array, J: Array) -> RobustFit:
+    """The fit without the rows that do not belong, from the ordinary fit `start`; x_calc, J: of it, as of
+    `studentised`."""
     n = len(problem)
     all_rows = np.ones(n, dtype=bool)
-    d2 = studentised(problem, free, start, all_rows)
+    d2 = first = studentised(problem, start, all_rows, x_calc, J)
     scale = _scale(d2)
     if d2.max() <= limit(n) * max(1.0, scale):
         return RobustFit(fit=start, keep=all_rows, distance2=d2, scale=scale, misfit=False)
@@ -101,7 +103,8 @@ def robust_fit(problem: Problem, free: FreeParameters, start: Fit) -> RobustFit:
         if keep.mean() < 1.0 - LARGEST_SHARE or 2 * keep.sum() <= fit.N.shape[0] + 4:
             break
         fit = minimise(problem, free, fit, weight=keep.astype(float))
-        d2 = studentised(problem, free, fit, keep)
+        b = blocks(problem, free, fit)
+        d2 = studentised(problem, fit, keep, b.x_D, jacobian(problem, free, b))
         scale = _scale(d2[keep])
         unit = max(1.0, scale)
         new_keep = d2 <= limit_beside(d2[d2 > limit(n) * unit] / unit, n) * unit
@@ -110,6 +113,4 @@ def robust_fit(problem: Problem, free: FreeParameters, start: Fit) -> RobustFit:
         if (new_keep == keep).all():
             return RobustFit(fit=fit, keep=keep, distance2=d2, scale=scale, misfit=False)
         keep = new_keep
-    return RobustFit(
-        fit=start, keep=all_rows, distance2=studentised(problem, free, start, all_rows), scale=scale, misfit=True
-    )
+    return RobustFit(fit=start, keep=all_rows, distance2=first, scale=scale, misfit=True)

@@ -9,10 +9,11 @@ is reached from there look poor, the 24 rotations of the cube and two turned cop
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from tomopose.calibration.model.problem import Problem
@@ -54,67 +55,112 @@ def ray_equations(problem: Problem) -> Rays:
 
 
 def _solve(N: Array, g: Array) -> Array:
-    """N^-1 g, directions without information left at zero."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
-    value, V = np.linalg.eigh(N * scale[:, None] * scale)
-    good = value > RANK_TOLERANCE * value[-1]
-    V = V[:, good]
-    result: Array = scale * (V @ ((V.T @ (scale * g)) / value[good]))
-    return result
+    """N^-1 g, (a, m), of matrices N (a, m, m) and g (a, m); directions without information are left at zero."""
+    scale = 1.0 / np.sqrt(np.maximum(np.einsum("aii->ai", N), 1e-300))
+    value, V = np.linalg.eigh(N * scale[:, :, None] * scale[:, None, :])
+    good = value > RANK_TOLERANCE * value[:, -1:]
+    z = np.where(good, np.einsum("aij,ai->aj", V, scale * g) / np.where(good, value, 1.0), 0.0)
+    return np.asarray(scale * (V @ z[:, :, None])[..., 0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stack:
+    """Several readings of k images each: poses R (a, k, 3, 3), t (a, k, 3), ball (a, k) of `balls`; rays n (a, k, 2,
+    3), d (a, k, 2), source (a, 3)."""
+
+    R: Array
+    t: Array
+    ball: npt.NDArray[np.int64]
+    balls: int
+    n: Array
+    d: Array
+    source: Array
+
+    @classmethod
+    def of(cls, problems: Sequence[Problem], rays: Sequence[Rays], rows: Sequence[npt.NDArray[np.int64]]) -> _Stack:
+        """The rows (k,) of problems that have equally many balls."""
+        each = list(zip(problems, rays, rows, strict=True))
+        return cls(
+            R=np.stack([p.R_MH[k] for p, _, k in each]),
+            t=np.stack([p.t_MH[k] for p, _, k in each]),
+            ball=np.stack([p.ball[k] for p, _, k in each]),
+            balls=len(problems[0].ball_ids),
+            n=np.stack([r.n[k] for _, r, k in each]),
+            d=np.stack([r.d[k] for _, r, k in each]),
+            source=np.stack([r.source for r in rays]),
+        )
+
+
+def _positions(s: _Stack, R_HT: Array) -> tuple[Array, Array]:
+    """t_HT (a, 3) and t (a, balls, 3) that fit best under given R_HT (a, 3, 3): linear."""
+    a, k = s.t.shape[:2]
+    nR = (s.n.reshape(a, 2 * k, 3) @ R_HT).reshape(a, k, 2, 3)
+    A: Array = np.zeros((a, k, 2, 3 + 3 * s.balls))
+    A[..., :3] = s.n
+    if s.balls == 1:
+        A[..., 3:] = nR @ s.R
+    else:
+        column = 3 + 3 * s.ball[:, :, None] + np.arange(3)
+        np.put_along_axis(A, np.broadcast_to(column[:, :, None, :], (a, k, 2, 3)), nR @ s.R, axis=3)
+    b = -s.d - (nR @ s.t[..., None])[..., 0]
+    A = A.reshape(a, 2 * k, -1)
+    At = np.swapaxes(A, 1, 2)
+    x = _solve(At @ A, (At @ b.reshape(a, 2 * k, 1))[..., 0])
+    return x[:, :3], x[:, 3:].reshape(a, s.balls, 3)
 
 
 def positions_for(problem: Problem, R_HT: Array, rays: Rays) -> tuple[Array, Array]:
     """t_HT (3,) and t (balls, 3) that fit best under a given R_HT: linear."""
-    k, n_b = len(problem), len(problem.ball_ids)
-    nR = rays.n @ R_HT
-    A: Array = np.zeros((k, 2, 3 + 3 * n_b))
-    A[:, :, :3] = rays.n
-    if n_b == 1:
-        A[:, :, 3:] = nR @ problem.R_MH
-    else:
-        column = 3 + 3 * problem.ball[:, None] + np.arange(3)
-        np.put_along_axis(A, np.broadcast_to(column[:, None, :], (k, 2, 3)), nR @ problem.R_MH, axis=2)
-    b = -rays.d - (nR @ problem.t_MH[:, :, None])[..., 0]
-    A = A.reshape(2 * k, -1)
-    x = _solve(A.T @ A, A.T @ b.ravel())
-    return x[:3], x[3:].reshape(n_b, 3)
+    t_HT, t = _positions(_Stack.of([problem], [rays], [np.arange(len(problem))]), R_HT[None])
+    return t_HT[0], t[0]
 
 
-def resection(problem: Problem, t: Array, rays: Rays) -> Array:
-    """R_HT (3, 3) from the linear resection with the balls taken at t (balls, 3).
+def _resections(s: _Stack, t: Array) -> Array:
+    """R_HT (a, 3, 3) from the linear resection with the balls taken at t (a, balls, 3).
 
     Written from one source position s, n . (A y + c) + l (n . s + d) = 0 with c = t_HT - l s is homogeneous in
     (A, c, l); l drops out where the source keeps its place in T, that is, while the table does not move.  A is a
     rotation except for its scale and sign, which det A > 0 settles: the mirrored solution is never taken.
     """
-    n = rays.n
-    y = (problem.R_MH @ t[problem.ball][:, :, None])[..., 0] + problem.t_MH
-    k = len(problem)
-    rest = n @ rays.source + rays.d
-    moved = np.abs(rest).max() > MOVED_SOURCE * np.linalg.norm(rays.source) * np.abs(n).max()
-    A: Array = np.empty((k, 2, 13 if moved else 12))
-    A[:, :, :9] = (n[:, :, :, None] * y[:, None, None, :]).reshape(k, 2, 9)
-    A[:, :, 9:12] = n
-    if moved:
-        A[:, :, 12] = rest
-    A = A.reshape(2 * k, -1)
-    N = A.T @ A
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
-    x = scale * np.linalg.eigh(N * scale[:, None] * scale)[1][:, 0]
-    B = x[:9].reshape(3, 3)
-    U, _, V = np.linalg.svd(-B if np.linalg.det(B) < 0 else B)
+    a, k = s.t.shape[:2]
+    y = (s.R @ np.take_along_axis(t, s.ball[:, :, None], axis=1)[..., None])[..., 0] + s.t
+    rest = (s.n @ s.source[:, None, :, None])[..., 0] + s.d
+    far = np.linalg.norm(s.source, axis=1) * np.abs(s.n).max(axis=(1, 2, 3))
+    moved = np.abs(rest).max(axis=(1, 2)) > MOVED_SOURCE * far
+    A: Array = np.empty((a, k, 2, 13))
+    A[..., :9] = (s.n[..., :, None] * y[:, :, None, None, :]).reshape(a, k, 2, 9)
+    A[..., 9:12] = s.n
+    A[..., 12] = rest
+    A = A.reshape(a, 2 * k, 13)
+    N = np.swapaxes(A, 1, 2) @ A
+    B = np.empty((a, 3, 3))
+    for which, m in ((moved, 13), (~moved, 12)):
+        if which.any():
+            part = N[which, :m, :m]
+            scale = 1.0 / np.sqrt(np.maximum(np.einsum("aii->ai", part), 1e-300))
+            V = np.linalg.eigh(part * scale[:, :, None] * scale[:, None, :])[1]
+            B[which] = (scale * V[:, :, 0])[:, :9].reshape(-1, 3, 3)
+    U, _, V = np.linalg.svd(np.where(np.linalg.det(B) < 0, -1.0, 1.0)[:, None, None] * B)
     # of (nearly) flat data the sign of det may still be lost
-    result: Array = U @ V if np.linalg.det(U @ V) > 0 else U @ np.diag([1.0, 1.0, -1.0]) @ V
-    return result
+    U[:, :, 2] *= np.where(np.linalg.det(U @ V) > 0, 1.0, -1.0)[:, None]
+    return np.asarray(U @ V)
+
+
+def closed_forms(
+    problems: Sequence[Problem], rays: Sequence[Rays], rows: Sequence[npt.NDArray[np.int64]]
+) -> list[tuple[Array, Array, Array]]:
+    """R_HT, t_HT, t of each by the alternation of the two linear steps, from rows (k,) of it, equally many of each."""
+    s = _Stack.of(problems, rays, rows)
+    t = np.zeros((len(problems), s.balls, 3))
+    for _ in range(ROUNDS):
+        R_HT = _resections(s, t)
+        t_HT, t = _positions(s, R_HT)
+    return list(zip(R_HT, t_HT, t, strict=True))
 
 
 def closed_form(problem: Problem, rays: Rays) -> tuple[Array, Array, Array]:
     """R_HT, t_HT, t by the alternation of the two linear steps."""
-    t = np.zeros((len(problem.ball_ids), 3))
-    for _ in range(ROUNDS):
-        R_HT = resection(problem, t, rays)
-        t_HT, t = positions_for(problem, R_HT, rays)
-    return R_HT, t_HT, t
+    return closed_forms([problem], [rays], [np.arange(len(problem))])[0]
 
 
 def turned_about_beam(problem: Problem, R_HT: Array, rays: Rays) -> tuple[Array, Array, Array]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.checks.scanner_tests import Explanation
+from tomopose.calibration.checks.score_tests.ranking import Explanation
 from tomopose.calibration.model.assumed import Assumed
 from tomopose.calibration.model.budget import Halves, ScanBudget, budget_words
 from tomopose.calibration.model.unseen import Unseen, unseen_unit

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-from tomopose.calibration.checks.convention_tests import Hypothesis
+from tomopose.calibration.checks.conventions.hypothesis import Hypothesis
 from tomopose.calibration.checks.stability import Effect, OutlierBlock, RepeatedPose, Stability
 from tomopose.calibration.checks.verdict import Finding
 from tomopose.calibration.result import (

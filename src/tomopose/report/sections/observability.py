@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tomopose.calibration.checks.convention_tests import WORDS, Hypothesis
+from tomopose.calibration.checks.conventions.hypothesis import WORDS, Hypothesis
 from tomopose.calibration.result import Calibration
 from tomopose.report.figures.coverage_figures import correlation_map, singular_values
 from tomopose.report.page import Block, Section, Table, Words

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tomopose.calibration.checks.convention_tests import Diagnosis
-from tomopose.calibration.checks.scanner_tests import ScannerTests
+from tomopose.calibration.checks.conventions.hypothesis import Diagnosis
+from tomopose.calibration.checks.score_tests.scanner_tests import ScannerTests
 from tomopose.calibration.checks.stability import Stability
 from tomopose.calibration.model.budget import Halves
 from tomopose.calibration.rigid.contradiction import Contradicted

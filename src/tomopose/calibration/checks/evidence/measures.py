@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
-from tomopose.calibration.checks.convention_tests import BETTER, MUCH_BETTER, other_unit_words
+from tomopose.calibration.checks.conventions.hypothesis import BETTER, MUCH_BETTER, other_unit_words
 from tomopose.calibration.checks.evidence.evidence import MISFIT_CHI2, Evidence
 from tomopose.calibration.checks.stability import Effect
 

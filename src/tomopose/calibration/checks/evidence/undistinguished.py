@@ -12,10 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from tomopose.calibration.checks.alternative import Alternative
-from tomopose.calibration.checks.convention_tests import Diagnosis, optimum_under
+from tomopose.calibration.checks.conventions.alternative import Alternative
+from tomopose.calibration.checks.conventions.fits import optimum_under
+from tomopose.calibration.checks.conventions.hypothesis import Diagnosis
+from tomopose.calibration.checks.conventions.orientation_readings import orientation_alternatives
 from tomopose.calibration.checks.evidence.evidence import Undistinguished
-from tomopose.calibration.checks.orientation_readings import orientation_alternatives
 from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.model.silhouettes import chain_matrices

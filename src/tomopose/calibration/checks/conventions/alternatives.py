@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from tomopose.calibration.checks.alternative import Alternative, Change
-from tomopose.calibration.checks.orientation_readings import POSES, orientation_alternatives
+from tomopose.calibration.checks.conventions.alternative import Alternative, Change
+from tomopose.calibration.checks.conventions.orientation_readings import POSES, orientation_alternatives
 from tomopose.calibration.model.problem import POSITION_UNITS, Problem, rotated
 
 TABLE_OFFSET = np.radians(5.0)

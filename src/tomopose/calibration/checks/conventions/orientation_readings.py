@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tomopose.calibration.checks.alternative import Alternative, Change
+from tomopose.calibration.checks.conventions.alternative import Alternative, Change
 from tomopose.calibration.model.problem import Problem, rotated
 from tomopose.geometry.rotations import CONVENTIONS, convention_from_rotation, exp_rotation
 from tomopose.units import Array

@@ -10,14 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from tomopose.calibration.checks.effects import effects_of, steps_of
-from tomopose.calibration.checks.scanner_tests import (
-    Ranked,
-    ScannerTests,
-    Whitened,
-    evidence_together,
-    ranked_explanations,
-)
+from tomopose.calibration.checks.score_tests.effects import effects_of, steps_of
+from tomopose.calibration.checks.score_tests.ranking import Ranked, ranked_explanations
+from tomopose.calibration.checks.score_tests.scanner_tests import ScannerTests, evidence_together
+from tomopose.calibration.checks.score_tests.score import Whitened
 from tomopose.calibration.model.ball_projection import ProjectionBlocks
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters

@@ -5,14 +5,13 @@ All columns are whitened; a size is in the unit that the words name.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 
 import numpy as np
 
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, ProjectionBlocks
-from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.model.problem import Problem, elapsed
 from tomopose.calibration.model.unseen import turns
 from tomopose.geometry.extent import largest_distance
 from tomopose.geometry.rotations import skew
@@ -52,12 +51,21 @@ class Effect:
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """C (2 n, c): whitened columns of an effect;  constant: how many of them, the first, are no part of the effect but
-    must be free beside it."""
+    """px: of some rows (k of n), the columns (k, 2, c) px of an effect;  constant: how many of them, the first, are no
+    part of the effect but must be free beside it."""
 
     effect: Effect
-    C: Array
+    px: Callable[[slice], Array]
     constant: int = 0
+
+
+def white_columns(problem: Problem, columns: Sequence[Columns], rows: slice = slice(None)) -> list[Array]:
+    """(2 k, c) each: whitened columns of effects in some rows, views of one array."""
+    each = [c.px(rows) for c in columns]
+    white = problem.W[rows] @ np.concatenate(each, axis=2)
+    flat = white.reshape(2 * len(white), -1)
+    ends = np.cumsum([c.shape[2] for c in each])
+    return [flat[:, end - c.shape[2] : end] for c, end in zip(each, ends, strict=True)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,35 +137,19 @@ def _length(name: str, kind: str, short: str, text: str, factor: float, order: i
     return Effect(name=name, kind=kind, short=short, words=words)
 
 
-def elapsed(problem: Problem) -> Array:
-    """(n,) time since the first image, s; the place in the sequence where no times are known."""
-    if problem.time_utc is not None:
-        try:
-            t = np.array([datetime.fromisoformat(s).timestamp() for s in problem.time_utc])
-        except ValueError:
-            t = np.zeros(0)
-        if t.size and np.ptp(t) > 0:
-            return np.asarray(t - t.min())
-    return np.arange(len(problem), dtype=np.float64)
-
-
-def _white(problem: Problem, C: Array) -> Array:
-    return np.asarray((problem.W @ C).reshape(2 * len(problem), -1))
-
-
 def effects_of(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
     """All effects without a place: scanner, panel, manipulator, table, time."""
-    n = len(problem)
-    found = [
-        Columns(effect=scanner_effect(name), C=_white(problem, b.J_scanner[:, :, [k]]))
-        for k, name in enumerate(SCANNER_COLUMNS)
-    ]
+    found = [_scanner_columns(b, k, name) for k, name in enumerate(SCANNER_COLUMNS)]
     found += _panel(problem, b)
     found += _manipulator(problem, b)
     found += _table(problem, b)
-    if n > 2 * DRIFT_ORDER:
+    if len(problem) > 2 * DRIFT_ORDER:
         found += _drifts(problem, b)
     return found
+
+
+def _scanner_columns(b: ProjectionBlocks, k: int, name: str) -> Columns:
+    return Columns(effect=scanner_effect(name), px=lambda rows: b.J_scanner[rows, :, k : k + 1])
 
 
 def pixel_origin(problem: Problem) -> Columns:
@@ -172,7 +164,7 @@ def pixel_origin(problem: Problem) -> Columns:
         odds=ORIGIN_ODDS,
         sizes=(0.5, 1.0),
     )
-    return Columns(effect=effect, C=_white(problem, np.ones((len(problem), 2, 1))))
+    return Columns(effect=effect, px=lambda rows: np.ones((len(problem.alpha[rows]), 2, 1)))
 
 
 def _panel(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
@@ -191,31 +183,36 @@ def _panel(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
                     f"the panel shows a radial distortion of {float(size[0]):+.2g} px at its corners"
                 ),
             ),
-            C=_white(problem, radial[:, :, None]),
+            px=lambda rows: radial[rows, :, None],
         )
     ]
     cell = np.clip((b.x_D / size * TILES).astype(int), 0, TILES - 1) @ [1, TILES]
     hit = [k for k in np.unique(cell) if (cell == k).sum() >= 4]
     if len(hit) > 2:
-        tiles = np.zeros((len(problem), 2, 2 * len(hit)))
-        for j, k in enumerate(hit):
-            tiles[cell == k, 0, 2 * j] = tiles[cell == k, 1, 2 * j + 1] = 1.0
+        place = np.searchsorted(hit, cell)
+        on = np.isin(cell, hit)
+
+        def tiles(rows: slice) -> Array:
+            k, where, shown = np.arange(len(cell[rows])), place[rows], on[rows]
+            C = np.zeros((len(k), 2, 2 * len(hit)))
+            for e in (0, 1):
+                C[k[shown], e, 2 * where[shown] + e] = 1.0
+            return C
+
         found.append(
             Columns(
                 effect=_fixed(
                     "tile map", "panel", "displaced tiles of the panel", "the panel's parts (tiles) are displaced"
                 ),
-                C=_white(problem, tiles),
+                px=tiles,
             )
         )
     return found
 
 
-def rotation_scale_columns(b: ProjectionBlocks, origin: Array) -> Array:
-    """(n, 2, 3) px: by the scale errors of the rotations about x, y, z.  origin (n, 3): the plate's origin in H."""
-    w = turns(b.R_MH)
-    by_turn = -b.G_H @ skew(b.x_H - origin)
-    return by_turn * w[:, None, :]
+def _axis_scale(b: ProjectionBlocks, t: Array, i: int) -> Callable[[slice], Array]:
+    """Columns of a scale of the translations t (n, 3) along the axis i."""
+    return lambda rows: (b.G_H[rows, :, i] * t[rows, i, None])[:, :, None]
 
 
 def _scale_words(c: str) -> Words:
@@ -233,18 +230,18 @@ def _manipulator(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
                 short=f"translation scale of {c}",
                 words=_scale_words(c),
             ),
-            C=_white(problem, (b.G_H[:, :, i] * t[:, i, None])[:, :, None]),
+            px=_axis_scale(b, t, i),
         )
         for i, c in enumerate("xyz")
     ]
-    square = np.stack([b.G_H[:, :, i] * t[:, j, None] for i in range(3) for j in range(3) if i != j], axis=2)
+    pairs = [(i, j) for i in range(3) for j in range(3) if i != j]
     found.append(
         Columns(
             effect=_fixed("axes", "manipulator", "axes of the manipulator not square or not parallel"),
-            C=_white(problem, square),
+            px=lambda rows: np.stack([b.G_H[rows, :, i] * t[rows, j, None] for i, j in pairs], axis=2),
         )
     )
-    scale = rotation_scale_columns(b, t)
+    w = turns(b.R_MH)
     found.append(
         Columns(
             effect=Effect(
@@ -257,7 +254,7 @@ def _manipulator(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
                     + " about x, y, z"
                 ),
             ),
-            C=_white(problem, scale),
+            px=lambda rows: (-b.G_H[rows] @ skew(b.x_H[rows] - t[rows])) * w[rows, None, :],
         )
     )
     return found
@@ -277,13 +274,21 @@ def _table(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
         waves = np.column_stack([f(k * alpha) for k in orders for f in (np.sin, np.cos)])
     else:
         waves = np.eye(len(angles))[which][:, 1:]
-    turn = by_angle[:, :, None] * waves[:, None, :]
-    found = [Columns(effect=_fixed("table angle", "table", "errors of the table's angle"), C=_white(problem, turn))]
+    found = [
+        Columns(
+            effect=_fixed("table angle", "table", "errors of the table's angle"),
+            px=lambda rows: by_angle[rows, :, None] * waves[rows, None, :],
+        )
+    ]
     if len(angles) > FEW_ANGLES:
-        G = b.J_t_HT
-        shift = (G[:, :, :, None] * waves[:, None, None, :]).reshape(len(alpha), 2, -1)
-        found.append(Columns(effect=_fixed("table wobble", "table", "wobble of the table"), C=_white(problem, shift)))
+        wobble = _fixed("table wobble", "table", "wobble of the table")
+        found.append(Columns(effect=wobble, px=lambda rows: _products(b.J_t_HT[rows], waves[rows])))
     return found
+
+
+def _products(D: Array, course: Array) -> Array:
+    """(k, 2, a b): each of the columns D (k, 2, a) times each course (k, b), by `a` first."""
+    return np.asarray((D[:, :, :, None] * course[:, None, None, :]).reshape(len(D), 2, -1))
 
 
 def _mount(b: ProjectionBlocks) -> Array:
@@ -310,10 +315,17 @@ def _drifts(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
             ),
             ("ball drift", "drift of the ball", "the ball drifts by {:.2g} um over the run", 1000.0, b.J_t_HT),
         ):
-            C = (base[:, :, None, :] * course[:, None, : order + 1, None]).reshape(len(problem), 2, -1)
             effect = _length(name if order > 1 else f"{name}, {ending}", "time", short, text, factor, order)
-            found.append(Columns(effect=effect, C=_white(problem, C), constant=base.shape[2]))
+            px = _over_time(base, course[:, : order + 1])
+            found.append(Columns(effect=effect, px=px, constant=base.shape[2]))
     return found
+
+
+def _over_time(base: Array, course: Array) -> Callable[[slice], Array]:
+    """Columns of base (n, 2, c) that follow the courses (n, k), by course first."""
+    return lambda rows: (base[rows][:, :, None, :] * course[rows][:, None, :, None]).reshape(
+        len(course[rows]), 2, base.shape[2] * course.shape[1]
+    )
 
 
 IMAGE_STEP_ODDS = -8.0

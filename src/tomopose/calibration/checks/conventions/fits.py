@@ -1,0 +1,188 @@
+"""An alternative convention, fitted: a linear start, the optimum of some rows, and of all where that may be right."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from tomopose.calibration.checks.conventions.hypothesis import BELONGING, BELONGING_MEAN
+from tomopose.calibration.model.parameters import (
+    UNITS,
+    FreeParameters,
+    ImpossibleScannerError,
+    adjusted_scanners,
+    free_parameters,
+)
+from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.model.silhouettes import chain_matrices, size_ratio_of
+from tomopose.calibration.rigid.fit import Fit, minimise, residuals, whitened2
+from tomopose.calibration.rigid.start import Rays, closed_forms, other_starts, ray_equations, turned_about_beam
+from tomopose.units import Array
+
+ITERATIONS = 20
+"""An alternative that is right needs fewer; one that is wrong is not worth more."""
+
+FIRST_ROWS, HOPELESS = 48, 100.0
+"""Where there are more than twice as many rows, an alternative is fitted to so many of them first; one that then leaves
+so many times the declared reading's chi2 (or dof) in all rows is wrong, and is not fitted to all of them."""
+
+SCANNER_GAIN = 1e3
+"""Values of the scanner that were off by 30 times what is assumed of them would lower chi2 so much."""
+
+AT_ONCE = 4096
+"""Rows whose linear starts are calculated together: some megabytes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Left:
+    """What a fit leaves.  d_rms: px;  sigmas: rms residual of a coordinate in stated standard uncertainties, of the
+    80 % of the centres that fit best;  share: d_rms over the rms spread of the centres."""
+
+    d_rms: float
+    sigmas: float
+    share: float
+
+    @classmethod
+    def of(cls, problem: Problem, r: Array) -> Left:
+        """r (n, 2) px: residuals of all rows."""
+        d2 = np.sort(whitened2(problem, r))
+        kept = d2[: max(1, int(np.ceil(BELONGING * len(d2))))]
+        d_rms = float(np.sqrt((r**2).sum() / len(r)))
+        spread = float(np.sqrt(((problem.x_D - problem.x_D.mean(axis=0)) ** 2).sum() / len(r)))
+        return cls(
+            d_rms=d_rms,
+            sigmas=float(np.sqrt(kept.mean() / BELONGING_MEAN)),
+            share=d_rms / spread if spread > 0 else 0.0,
+        )
+
+
+def size_ratio(problem: Problem, free: FreeParameters, fit: Fit) -> float:
+    """Measured size of the silhouettes over the calculated one; NaN where it is not known or cannot be calculated."""
+    if problem.outline is None or problem.ball_diameter is None or not np.isfinite(fit.chi2):
+        return float("nan")
+    try:
+        scanners = adjusted_scanners(problem.scanners, free, fit.delta)
+    except ImpossibleScannerError:  # a wrong reading may end anywhere
+        return float("nan")
+    found = size_ratio_of(problem, chain_matrices(problem, scanners, fit.T_HT), fit.t[problem.ball])
+    return float("nan") if found is None else found
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """A problem as an alternative reads it, with its rays and the rows (k,) that it is fitted to first."""
+
+    problem: Problem
+    rays: Rays
+    rows: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(cls, problem: Problem, rays: Rays, *, thoroughly: bool) -> Reading:
+        """With all rows first where they are few, or where it is to be thorough."""
+        n = len(problem)
+        few = thoroughly or n <= 2 * FIRST_ROWS or len(problem.ball_ids) > 1
+        rows = np.arange(n) if few else np.unique(np.linspace(0, n - 1, FIRST_ROWS).round().astype(np.int64))
+        return cls(problem=problem, rays=rays, rows=rows)
+
+    @property
+    def whole(self) -> bool:
+        return len(self.rows) == len(self.problem)
+
+    @property
+    def weight(self) -> Array | None:
+        """(n,) 1 for the rows that it is fitted to first; None for all."""
+        if self.whole:
+            return None
+        weight = np.zeros(len(self.problem))
+        weight[self.rows] = 1.0
+        return weight
+
+    def part(self) -> tuple[Problem, Rays]:
+        """Those rows alone."""
+        if self.whole:
+            return self.problem, self.rays
+        few = Rays(n=self.rays.n[self.rows], d=self.rays.d[self.rows], source=self.rays.source)
+        return self.problem.select(self.rows), few
+
+
+def linear_starts(readings: Sequence[Reading]) -> list[tuple[Array, Array, Array]]:
+    """R_HT, t_HT, t of each in closed form, of those with as many rows and balls at once."""
+    found: list[tuple[Array, Array, Array]] = [(np.zeros((0, 0)),) * 3] * len(readings)
+    alike: dict[tuple[int, int], list[int]] = {}
+    for k, one in enumerate(readings):
+        alike.setdefault((len(one.rows), len(one.problem.ball_ids)), []).append(k)
+    for (n, _), members in alike.items():
+        most = max(1, AT_ONCE // n)
+        for first in range(0, len(members), most):
+            some = members[first : first + most]
+            each = [readings[k] for k in some]
+            starts = closed_forms([e.problem for e in each], [e.rays for e in each], [e.rows for e in each])
+            for k, start in zip(some, starts, strict=True):
+                found[k] = start
+    return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fitted:
+    """fit: the optimum, or where part of the rows lead;  r (n, 2) px: what it leaves in all rows."""
+
+    fit: Fit
+    r: Array
+
+
+def fitted(
+    one: Reading,
+    start: tuple[Array, Array, Array],
+    free: FreeParameters,
+    held: FreeParameters,
+    *,
+    starts: int = 0,
+    hopeless: float = np.inf,
+) -> Fitted:
+    """The optimum under an alternative, or where part of the rows lead if that leaves a hopeless chi2 in all rows.
+
+    starts: rotations that are tried where the closed form leads nowhere.
+    """
+    problem, weight = one.problem, one.weight
+    enough = np.inf if one.whole else SCANNER_GAIN * hopeless * len(one.rows) / len(problem)
+    fit = minimise(problem, held, start, weight=weight, iterations=ITERATIONS)
+    if not np.isfinite(fit.chi2):
+        fit = _from_elsewhere(one, start, held, starts)
+    if len(free) and fit.chi2 < enough:
+        fit = minimise(problem, free, fit, weight=weight, iterations=ITERATIONS)
+    if len(fit.delta) != len(free):
+        fit = replace(fit, delta=np.zeros(len(free)))
+    r = residuals(problem, free, fit)
+    if one.whole:
+        return Fitted(fit=fit, r=r)
+    chi2 = float(whitened2(problem, r).sum() + (free.information * fit.delta**2).sum())
+    if not chi2 < hopeless:
+        # a ball behind the source in any row makes the reading impossible
+        return Fitted(fit=replace(fit, chi2=chi2 if np.isfinite(chi2) else np.inf), r=r)
+    fit = minimise(problem, free, fit, iterations=ITERATIONS)
+    return Fitted(fit=fit, r=residuals(problem, free, fit))
+
+
+def _from_elsewhere(one: Reading, start: tuple[Array, Array, Array], held: FreeParameters, starts: int) -> Fit:
+    """The optimum from half a turn about the beam, or from the best of some rotations."""
+    part, rays = one.part()
+    fit = minimise(part, held, turned_about_beam(part, start[0], rays), iterations=ITERATIONS)
+    if np.isfinite(fit.chi2):
+        return fit
+    # mirrored data have no closed form in front of the source; the residual they leave is still worth knowing
+    others = (
+        minimise(part, held, other, iterations=ITERATIONS)
+        for other in itertools.islice(other_starts(part, rays), starts)
+    )
+    return minimise(part, held, min((fit, *others), key=lambda one: one.chi2))
+
+
+def optimum_under(problem: Problem, free: FreeParameters) -> Fit:
+    """The optimum of a problem that an alternative made."""
+    one = Reading(problem=problem, rays=ray_equations(problem), rows=np.arange(len(problem)))
+    held = free_parameters(problem.scanners, fix=tuple(UNITS))
+    return fitted(one, linear_starts([one])[0], free, held).fit
