@@ -107,7 +107,7 @@ from .io.observations_csv import read_observations as read_observations
 from .io.observations_csv import write_observations as write_observations
 from .io.pairing import pair_images as pair_images
 from .io.poses_csv import read_poses as read_poses
-from .io.poses_csv import write_poses as write_poses
+from .io.poses_csv_writing import write_poses as write_poses
 from .io.scanner_json import read_scanner as read_scanner
 from .io.scanner_json import write_scanner as write_scanner
 from .io.table_text import TextTable as TextTable

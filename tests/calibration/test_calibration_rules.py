@@ -18,7 +18,8 @@ from tomopose.calibration.checks.evidence.evidence import (
     ScatterFound,
     Undistinguished,
 )
-from tomopose.calibration.checks.rules import ARRANGEMENTS, MODELS, RULES, findings, rules_table
+from tomopose.calibration.checks.rule import ARRANGEMENTS, MODELS
+from tomopose.calibration.checks.rules import RULES, findings, rules_table
 from tomopose.calibration.checks.score_tests.ranking import Explanation, Ranked, Single
 from tomopose.calibration.checks.score_tests.scanner_tests import ScannerTests
 from tomopose.calibration.checks.stability import Effect, OutlierBlock, RepeatedPose, Stability
@@ -49,6 +50,7 @@ def clean(model: str = "rigid", arrangement: str = "moving-object") -> Evidence:
         expected_px=0.0205,
         spread_px=300.0,
         scan_px=None if arrangement == "twin" else 0.01,
+        stated_px=None if arrangement == "twin" else 0.1,
         diagnosis=diagnosis(factor=1.0, delta=40.0, outcome="worse"),
         stability=Stability(
             effects=(Effect(name="drift", p=0.3, size_px=0.004, share=0.01, words="the ball drifts"),),
@@ -185,6 +187,7 @@ def met(name: str, e: Evidence) -> Mapping[str, Any]:
         "repeated pose, set aside": {"stability": repeat(e), "outliers": ("188",)},
         "held-out poses": {"stability": replace(e.stability, held_out_rms=0.09, held_out_chi2=20.0)},
         "uncertainty of a tilted scan": {"scan_px": 0.3},
+        "uncertainty with all that is assumed": {"stated_px": 1.1, "stated_words": "1.1 px, of which 0.7 px from eta"},
         "scatter of the poses": {"scatter": ScatterFound(ratio=16.0, t_mm=5e-4, w_rad=1.2e-5)},
         "no better than trusted poses": {"against_rigid": AgainstRigid(chosen_px=0.03, rigid_px=0.02, better=False)},
         "size of the errors": {"size": 7.0},
@@ -225,7 +228,7 @@ def test_only_the_verdict_of_the_findings_counts_the_worst_first():
     assert judge(rows[:1]) == ("trustworthy", ())
 
 
-@pytest.mark.parametrize("name", ["residual_px", "chi2_dof", "scan_px"])
+@pytest.mark.parametrize("name", ["residual_px", "chi2_dof", "scan_px", "stated_px"])
 @pytest.mark.parametrize("model", MODELS)
 def test_what_is_not_a_number_passes_no_guard(name, model):
     e = replace(clean(model), **{name: float("nan")})

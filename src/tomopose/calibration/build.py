@@ -20,6 +20,7 @@ from tomopose.calibration.checks.rules import findings
 from tomopose.calibration.checks.score_tests.scanner_tests import ScannerTests
 from tomopose.calibration.checks.stability import stability
 from tomopose.calibration.model.assumed import Assumed
+from tomopose.calibration.model.budget import budget_words
 from tomopose.calibration.model.covariance import angles_by_tangent
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, unit_of
@@ -193,6 +194,8 @@ def evidence_of(f: Fitted, result: Calibration) -> Evidence:
         expected_px=f.stated_px,
         spread_px=float(np.sqrt(np.mean(np.sum((x - x.mean(axis=0)) ** 2, axis=1)))),
         scan_px=None if result.budget is None else result.budget.measured,
+        stated_px=None if result.budget is None else result.budget.total,
+        stated_words="" if result.budget is None else budget_words(result.budget, result.assumed),
         tests=f.tests,
         contradicted=f.contradicted,
         undistinguished=f.undistinguished,

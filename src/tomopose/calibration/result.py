@@ -11,7 +11,7 @@ import numpy as np
 from tomopose.calibration.checks.conventions.hypothesis import Hypothesis
 from tomopose.calibration.checks.score_tests.ranking import Explanation
 from tomopose.calibration.checks.stability import Stability
-from tomopose.calibration.checks.verdict import Finding, Verdict, judge
+from tomopose.calibration.checks.verdict import Finding, Judged
 from tomopose.calibration.model.assumed import Assumed
 from tomopose.calibration.model.budget import Halves, ScanBudget
 from tomopose.calibration.model.unseen import Unseen
@@ -105,7 +105,7 @@ class ViewDistances:
 
 
 @value
-class Calibration:
+class Calibration(Judged):
     """How the manipulator sits in the scanner.  Eq. (7) solved.
 
     scanner:      with the values of this calibration (freed parameters replaced by their estimates).
@@ -198,16 +198,6 @@ class Calibration:
             [p.name, value_with_uncertainty(p.value, p.u, p.unit), f"{2 * p.u:.2g} {p.unit}"] for p in self.parameters
         ]
         return verdict_html(self.verdict, lines, ["parameter", "value", "U (k = 2)"], rows)
-
-    @property
-    def verdict(self) -> Verdict:
-        """trustworthy | doubtful | rejected: the worst of the findings."""
-        return judge(self.checks)[0]
-
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """The words of the findings that give doubt, worst first."""
-        return judge(self.checks)[1]
 
     @property
     def inverse(self) -> bool:

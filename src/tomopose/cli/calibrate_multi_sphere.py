@@ -9,6 +9,7 @@ import typer
 
 from tomopose.cli.calibration_options import Options, repeatability_of
 from tomopose.cli.common import NOT_TRUSTWORTHY, OK, arguments, names
+from tomopose.cli.job import assumed_rows, finding_rows
 
 if TYPE_CHECKING:
     from tomopose import MultiSphereCalibration
@@ -102,8 +103,8 @@ def multi_sphere_summary(result: MultiSphereCalibration) -> tuple[dict[str, obje
         "views": n, "lost": dict(result.lost), "d_rms_px": result.d_rms, "chi2_dof": result.chi2_dof,
         "balls_used": [int(balls.min()), int(balls.max())],
         "points_sigma_px": sigma, "points_sigma_shared_px": shared, "alone_um": alone,
-        "findings": [{"rule": f.rule, "words": f.words, "cure": f.remedy, "verdict": f.verdict} for f in result.checks],
-        "assumed": [{"name": a.name, "sigma": a.sigma, "unit": a.unit, "from": a.source} for a in result.assumed],
+        "findings": finding_rows(result.checks),
+        "assumed": assumed_rows(result.assumed),
     }  # fmt: skip
     lines = [
         f"{result.verdict}: the standard's pose was found in {n} of {n + len(result.lost)} views",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,8 @@ RAW = re.compile(r"(?P<n_v>\d+)x(?P<n_u>\d+):(?P<dtype>[^:]+)(:(?P<header>\d+))?
 
 if TYPE_CHECKING:
     from tomopose import BallObservations, Calibration, PoseSequence, ProjectionMatrices, Scanner
+    from tomopose.calibration.checks.verdict import Finding
+    from tomopose.calibration.model.assumed import Assumed
     from tomopose.calibration.records.decisions import Decision
     from tomopose.io.images.sequence import ImageSequence
     from tomopose.manipulator.real_poses import ErrorModel
@@ -178,6 +180,16 @@ def write_calibration_folder(
         write_report(folder / "report.html", html)
 
 
+def finding_rows(checks: Iterable[Finding]) -> list[dict[str, object]]:
+    """The findings of a result, for programs."""
+    return [{"rule": f.rule, "words": f.words, "cure": f.remedy, "verdict": f.verdict} for f in checks]
+
+
+def assumed_rows(assumed: Iterable[Assumed]) -> list[dict[str, object]]:
+    """What was taken with an uncertainty that was not measured, for programs."""
+    return [{"name": a.name, "sigma": a.sigma, "unit": a.unit, "from": a.source} for a in assumed]
+
+
 def calibration_summary(calibration: Calibration) -> tuple[dict[str, Any], list[str]]:
     """The figures of a calibration, for programs and for people."""
     from tomopose.calibration.model.parameters import UNITS as units
@@ -195,11 +207,9 @@ def calibration_summary(calibration: Calibration) -> tuple[dict[str, Any], list[
         "poses_used": len(calibration.pose_id),
         "outliers": dict(calibration.outliers),
         "model": calibration.model,
-        "findings": [
-            {"rule": f.rule, "words": f.words, "cure": f.remedy, "verdict": f.verdict} for f in calibration.checks
-        ],
+        "findings": finding_rows(calibration.checks),
         "explanations": [e.words for e in calibration.explanations],
-        "assumed": [{"name": a.name, "sigma": a.sigma, "unit": a.unit, "from": a.source} for a in calibration.assumed],
+        "assumed": assumed_rows(calibration.assumed),
         "scan_px": None if calibration.budget is None else calibration.budget.total,
         "parameters": [{"name": p.name, "value": p.value, "u": p.u, "unit": p.unit} for p in calibration.parameters],
     }

@@ -8,7 +8,8 @@ from tomopose.io.matrices_npz import read_matrices, write_matrices
 from tomopose.io.notices import InputWarning
 from tomopose.io.observations_csv import read_observations, write_observations
 from tomopose.io.pairing import pair_images
-from tomopose.io.poses_csv import read_poses, write_poses
+from tomopose.io.poses_csv import read_poses
+from tomopose.io.poses_csv_writing import write_poses
 from tomopose.io.scanner_json import read_scanner, write_scanner
 
 __all__ = [

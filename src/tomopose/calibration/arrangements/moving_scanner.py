@@ -13,7 +13,8 @@ from tomopose.calibration.identified.calibrate import calibrate_kinematic, machi
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.result import Calibration, ViewDistances
 from tomopose.calibration.rigid.contradiction import as_stated
-from tomopose.calibration.solve import freed_names, rigid_calibration
+from tomopose.calibration.solve import freed_names
+from tomopose.calibration.trusted_poses import rigid_calibration
 from tomopose.errors import InputError, NotConvergedError, NotObservableError
 from tomopose.geometry.scanner import Scanner
 from tomopose.manipulator.error_models import corrected_poses

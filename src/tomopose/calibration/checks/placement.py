@@ -66,12 +66,12 @@ def depths(problem: Problem, fit: Fit, beam: Array | None = None) -> Array:
 
 def placement(problem: Problem, fit: Fit, beam: Array | None = None) -> Placement:
     """Of a fit; beam: of `beams`, if known."""
-    z = depths(problem, fit, beam)
+    z = np.sort(depths(problem, fit, beam))
     first = problem.scanners[problem.run[0]]
     return Placement(
-        nearest=float(z.min()),
-        median=float(np.median(z)),
-        farthest=float(z.max()),
+        nearest=float(z[0]),
+        median=float((z[(len(z) - 1) // 2] + z[len(z) // 2]) / 2),
+        farthest=float(z[-1]),
         d_SD=min(s.d_SD for s in problem.scanners),
         d_SR=first.d_SR,
     )

@@ -6,9 +6,6 @@ docs/concepts/verdict.md is made from here (`rules_table`) and held equal by a t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-
 import numpy as np
 
 from tomopose.calibration.checks.conventions.hypothesis import BETTER, MUCH_BETTER
@@ -20,46 +17,14 @@ from tomopose.calibration.checks.evidence.measures import (
     MISFIT_PX,
     NOTHING_FITS_PX,
     REPEAT_PX,
-    Found,
 )
+from tomopose.calibration.checks.rule import ARRANGEMENTS, MODELS, Rule
 from tomopose.calibration.checks.score_tests.ranking import DECISIVE
 from tomopose.calibration.checks.stability import SIGNIFICANT
-from tomopose.calibration.checks.verdict import Finding, Verdict
+from tomopose.calibration.checks.verdict import Finding
 from tomopose.calibration.model.covariance import WIDENING_PROBABILITY
 from tomopose.calibration.rigid.contradiction import CONTRADICTED
 from tomopose.calibration.rigid.outliers import LARGEST_SHARE
-
-MODELS = ("rigid", "kinematic", "slack")
-ARRANGEMENTS = ("moving-object", "moving-scanner", "twin", "turntable")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rule:
-    """name; condition: in words, with {limit}; limit; verdict of a calibration that meets the condition; reason: where
-    the limit comes from; measure(evidence, limit): what meets the condition; models, arrangements: where it applies."""
-
-    name: str
-    condition: str
-    limit: float
-    verdict: Verdict
-    reason: str
-    measure: Callable[[Evidence, float], Iterator[Found]]
-    models: tuple[str, ...] = MODELS
-    arrangements: tuple[str, ...] = ARRANGEMENTS
-
-    def findings(self, evidence: Evidence) -> Iterator[Finding]:
-        """What this rule finds in the evidence."""
-        if evidence.model in self.models and evidence.arrangement in self.arrangements:
-            for found in self.measure(evidence, self.limit):
-                yield Finding(
-                    rule=self.name,
-                    value=float(found.value),
-                    limit=self.limit,
-                    words=found.words,
-                    remedy=found.remedy,
-                    verdict=self.verdict,
-                )
-
 
 NONE = float("nan")
 
@@ -319,6 +284,16 @@ RULES: tuple[Rule, ...] = (
         verdict="doubtful",
         reason="a quarter of a pixel blurs edges as much as interpolation between voxels does",
         measure=measures.scan,
+        arrangements=("moving-object", "moving-scanner"),
+    ),
+    Rule(
+        name="uncertainty with all that is assumed",
+        condition="a tilt of 5 degrees carries more than {limit:g} px of standard uncertainty, with what was assumed "
+        "and not measured",
+        limit=1.0,
+        verdict="doubtful",
+        reason="a pixel on the panel is a voxel of the volume: beyond it, edges end in another voxel",
+        measure=measures.whole_scan,
         arrangements=("moving-object", "moving-scanner"),
     ),
     Rule(

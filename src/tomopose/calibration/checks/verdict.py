@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC
 from collections.abc import Iterable
 from typing import Literal, TypeAlias, get_args
 
@@ -33,6 +34,22 @@ class Finding:
     def __post_init__(self) -> None:
         if self.verdict not in VERDICTS:
             raise ShapeError(f"verdict {self.verdict!r} is not one of {', '.join(VERDICTS)}")
+
+
+class Judged(ABC):
+    """What has findings has a verdict: it follows from them and from nothing else."""
+
+    checks: tuple[Finding, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """trustworthy | doubtful | rejected: the worst of the findings."""
+        return judge(self.checks)[0]
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """The words of the findings that give doubt, worst first."""
+        return judge(self.checks)[1]
 
 
 def judge(checks: Iterable[Finding]) -> tuple[Verdict, tuple[str, ...]]:

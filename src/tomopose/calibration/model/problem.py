@@ -141,8 +141,8 @@ def _written_orientations(runs: Sequence[PoseSequence], rows: Sequence[Array]) -
         if poses.orientations is None or poses.convention != runs[0].convention:
             return None
         R = rotation_from_convention(np.array(poses.orientations), poses.convention)
-        apart = min(rotation_angle_between(R, T).max() for T in (poses.T_MH.R, np.swapaxes(poses.T_MH.R, 1, 2)))
-        if apart > SAME_ROTATION_RAD:
+        either = (poses.T_MH.R, np.swapaxes(poses.T_MH.R, 1, 2))
+        if not any(rotation_angle_between(R, T).max() <= SAME_ROTATION_RAD for T in either):
             return None
         parts.append(poses.orientations[k])
     return np.concatenate(parts)

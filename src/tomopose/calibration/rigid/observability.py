@@ -6,6 +6,7 @@ A direction counts as unobservable where its predicted standard uncertainty exce
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,6 +45,7 @@ class Observability:
         return float(s[0] / s[-1]) if s.size and s[-1] > 0 else float("inf")
 
 
+@functools.cache
 def scales(names: tuple[str, ...]) -> Array:
     """(m,) natural size of each coordinate: 1 mm, 0.1 rad, or what matters of a scanner parameter."""
     return np.array(
@@ -93,9 +95,8 @@ def _group(name: str) -> str:
 
 def _words(names: tuple[str, ...], v: Array) -> str:
     """A direction as "t_HT_x + 0.9 d_SR", or as the groups that move together where it has many coordinates."""
-    size = v / scales(names)
-    top = np.abs(size).max()
-    terms = [(n, x) for n, x in zip(names, v, strict=True) if abs(x) / scales((n,))[0] >= SHOWN * top]
+    size = np.abs(v / scales(names))
+    terms = [(n, x) for n, x, s in zip(names, v, size, strict=True) if s >= SHOWN * size.max()]
     if len(terms) > MOST_TERMS:
         groups = list(dict.fromkeys(_group(n) for n, _ in terms))
         return f"{', '.join(groups[:-1])} and {groups[-1]} together" if len(groups) > 1 else f"{groups[0]} together"

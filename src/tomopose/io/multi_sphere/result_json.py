@@ -8,6 +8,7 @@ import numpy as np
 
 from tomopose.calibration.arrangements.multi_sphere.result import MultiSphereCalibration
 from tomopose.files import require_absent, write_json
+from tomopose.io.calibration.checks_blocks import finding_document
 from tomopose.io.scanner_json import scanner_document
 from tomopose.observations import BallObservations
 from tomopose.values import require_types
@@ -26,10 +27,7 @@ def write_multi_sphere(path: str | Path, result: MultiSphereCalibration, *, forc
     wrong = result.manipulator_errors
     write_json(path, SCHEMA_NAME, {
         "verdict": result.verdict, "reasons": list(result.reasons),
-        "findings": [
-            {"rule": f.rule, "value": f.value, "limit": f.limit, "words": f.words, "cure": f.remedy,
-             "verdict": f.verdict} for f in result.checks
-        ],
+        "findings": [finding_document(f) for f in result.checks],
         "d_rms_px": result.d_rms, "chi2": solved.chi2, "dof": solved.dof, "chi2_dof": result.chi2_dof,
         "home": result.home.matrix,
         "views": [

@@ -11,7 +11,7 @@ from tomopose.calibration.arrangements.multi_sphere.identify import view_matrix
 from tomopose.calibration.arrangements.multi_sphere.path import BallView, PathSolution
 from tomopose.calibration.arrangements.multi_sphere.standard import SphereStandard
 from tomopose.calibration.arrangements.multi_sphere.view_pose import view_rows
-from tomopose.calibration.checks.verdict import Finding, Verdict, judge
+from tomopose.calibration.checks.verdict import Finding, Judged
 from tomopose.calibration.model.assumed import Assumed
 from tomopose.calibration.uncertainty.propagation import field_of_view_points
 from tomopose.errors import InputError
@@ -26,7 +26,7 @@ from tomopose.values import Column, Rows, value
 
 
 @value
-class MultiSphereCalibration(Rows):
+class MultiSphereCalibration(Judged, Rows):
     """One row a view whose pose was found.
 
     scanner:   with the values as estimated along the path; given: as they were before.
@@ -55,16 +55,6 @@ class MultiSphereCalibration(Rows):
     checks: tuple[Finding, ...] = ()
     repeatability: Repeatability | None = None
     provenance: Provenance | None = None
-
-    @property
-    def verdict(self) -> Verdict:
-        """trustworthy | doubtful | rejected: the worst of the findings."""
-        return judge(self.checks)[0]
-
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """The words of the findings that give doubt, worst first."""
-        return judge(self.checks)[1]
 
     @property
     def d(self) -> Array:

@@ -18,6 +18,23 @@ DEFAULT_SIGMA_MM = 0.001
 about 1 to 2 um for the distances."""
 
 
+THINNEST = 1e-3
+"""Spread of the balls beside their line over that along it.  Centres known to 1e-5 of the length (a micrometre in 100
+mm) leave the turn about the line uncertain by 1e-5 / THINNEST = 10 mrad, which moves a point as far beside the line as
+the object is long by a hundredth of its length: no scan can use that."""
+
+
+def require_not_in_line(centres: Array) -> None:
+    """NotObservableError where balls (m, 3), mm, are so nearly in a line that no image shows a turn about it."""
+    spread = np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)
+    if spread[1] < THINNEST * spread[0]:
+        raise NotObservableError(
+            "the balls lie in a line: a turn about it moves none of them",
+            direction="turn about the balls' line",
+            singular_values=spread.tolist(),
+        )
+
+
 @value
 class SphereStandard:
     """Balls of a calibrated object, in its own frame M.
@@ -44,13 +61,7 @@ class SphereStandard:
             raise InputError(f"the standard has {m} balls; a pose needs at least {FEWEST_BALLS}")
         if not np.isfinite(x).all() or not (np.isfinite(d).all() and (d > 0).all()):
             raise InputError("coordinates and diameters of the standard must be finite, diameters above 0")
-        spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
-        if spread[1] < 1e-3 * spread[0]:
-            raise NotObservableError(
-                "the balls of the standard lie in a line: a turn about it moves none of them",
-                direction="turn about the balls' line",
-                singular_values=spread.tolist(),
-            )
+        require_not_in_line(x)
         for i, j in combinations(range(m), 2):
             apart = float(np.linalg.norm(x[i] - x[j]))
             if apart < (d[i] + d[j]) / 2:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tomopose.calibration.arrangements.multi_sphere.standard import FEWEST_BALLS
+from tomopose.calibration.arrangements.multi_sphere.standard import FEWEST_BALLS, require_not_in_line
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks, whiteners
 from tomopose.errors import InputError, NotConvergedError, NotObservableError
 from tomopose.geometry.frames import Frame
@@ -65,13 +65,7 @@ def pose_from_balls(
         raise InputError(f"observed centres (m, 2) and balls (m, 3) must pair; got {x.shape} and {x_M.shape}")
     if m < FEWEST_BALLS:
         raise InputError(f"{m} balls do not determine a pose; at least {FEWEST_BALLS} are needed")
-    spread = np.linalg.svd(x_M - x_M.mean(axis=0), compute_uv=False)
-    if spread[1] < 1e-6 * spread[0]:
-        raise NotObservableError(
-            "the balls are in a line: a turn about it moves none of them",
-            direction="turn about the balls' line",
-            singular_values=spread.tolist(),
-        )
+    require_not_in_line(x_M)
     C = np.tile(np.eye(2), (m, 1, 1)) if covariance is None else np.asarray(covariance, dtype=np.float64)
     W = whiteners(C)
     starts = [start] if start is not None else _coarse_starts(scanner, x, x_M)

@@ -75,7 +75,8 @@ class Evidence:
     chi2_dof:     by the sigmas that were stated; chi2, dof: as the covariance rests on.
     widened:      whether the covariance grows with chi2/dof.
     residual_px, expected_px: d_rms, and what the stated sigmas explain of it;  spread_px: rms spread of the centres.
-    scan_px:      predicted standard uncertainty of a scan tilted by 5 degrees, px.
+    scan_px:      predicted standard uncertainty of a scan tilted by 5 degrees, px, were everything assumed exact.
+    stated_px:    the same with everything assumed;  stated_words: the sentence that names its parts.
     diagnosis:    alternative conventions, fitted by the model that trusts the poses.
     size:         identified errors over what the machine's file states.
     run_effects:  drift and lag of the run are among the parameters.
@@ -102,6 +103,8 @@ class Evidence:
     expected_px: float
     spread_px: float
     scan_px: float | None = None
+    stated_px: float | None = None
+    stated_words: str = ""
     diagnosis: Diagnosis | None = None
     stability: Stability | None = None
     scatter: ScatterFound | None = None

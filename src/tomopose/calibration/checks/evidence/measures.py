@@ -262,6 +262,16 @@ def scan(e: Evidence, limit: float) -> Iterator[Found]:
         )
 
 
+def whole_scan(e: Evidence, limit: float) -> Iterator[Found]:
+    """The uncertainty with everything that was assumed, whose parts the sentence names."""
+    if e.stated_px is not None and _above(e.stated_px, limit):
+        yield Found(
+            value=e.stated_px,
+            words=e.stated_words,
+            remedy="turn the table to a second angle, or state what you know better (sigma in scanner.json; --fix)",
+        )
+
+
 def scatter(e: Evidence, limit: float) -> Iterator[Found]:
     s = e.scatter
     if s is not None and _above(s.ratio, limit):
