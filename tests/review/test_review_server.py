@@ -151,7 +151,7 @@ def test_the_page_names_nothing_from_elsewhere(served):
 def test_decisions_are_kept_as_lines_and_undo_drops_the_last(fresh):
     status, _, body = fresh.own("POST", "decide", {"row": 3, "action": "leave-out", "why": " dust "})
     assert status == 200
-    assert json.loads(body)["rows"][3]["words"] == "left out by N. Sato: dust"
+    assert json.loads(body)["rows"]["3"]["words"] == "left out by N. Sato: dust"
     assert fresh.own("POST", "decide", {"row": 4, "action": "accept"})[0] == 200
     assert [(d.pose_id, d.action, d.why) for d in read_decisions(fresh.desk.journal)] == [
         ("p003", "leave-out", "dust"), ("p004", "accept", ""),

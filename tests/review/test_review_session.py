@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
 import tomopose as tp
-from tomopose.calibration.records.decisions import Measured
+from tomopose.calibration.records.decisions import Measured, read_decisions
 from tomopose.errors import DetectionError, InputError
+from tomopose.files import plain
+from tomopose.review.app import Desk
 from tomopose.review.crops import LARGEST_HALF, crop
 from tomopose.review.session import begin, decision_about, measured_again, predicted_centres
-from tomopose.review.view import residual_lengths, rows_view, worst_first
+from tomopose.review.view import residual_lengths, rows_view, state_view, worst_first
 
 
 @pytest.fixture
@@ -92,3 +96,51 @@ def test_a_crop_is_the_part_of_the_image_about_the_ball(project):
         assert head["kind"] == "uint16"
         np.testing.assert_array_equal(pixels, images[0][v0 : v0 + head["height"], u0 : u0 + head["width"]])
         assert max(pixels.shape) <= 2 * LARGEST_HALF + 1
+
+
+@pytest.fixture
+def desk(review, tmp_path):
+    return Desk(review=review[0], journal=tmp_path / "review.jsonl", who="N. Sato", save=lambda r: [])
+
+
+def test_a_decision_adds_a_line_and_sends_only_what_changed(desk):
+
+    def take(row: int, action: str) -> dict:
+        decision = desk.decision({"row": row, "action": action})
+        return desk.take(lambda r: r.with_decision(decision))
+
+    assert set(take(3, "accept")["rows"]) == {"3"}
+    used = len(desk.review.calibration.pose_id)
+    node = desk.journal.stat().st_ino
+    accepted = take(4, "accept")
+    assert desk.journal.stat().st_ino == node  # one line more, not another file
+    assert set(accepted["rows"]) == {"4"}
+    assert "result" not in accepted
+    assert [d["pose"] for d in accepted["decisions"]] == ["p004"]
+    solved = take(5, "leave-out")
+    assert len(solved["rows"]) == len(desk.review.detected)
+    assert solved["result"]["used"] == used - 1
+    undone = desk.take(lambda r: r.without_last())
+    assert (undone["keep"], undone["decisions"]) == (2, [])
+    assert read_decisions(desk.journal) == desk.review.decisions
+
+
+def test_a_page_that_follows_the_changes_shows_the_whole_state(desk):
+    shown = state_view(desk.review)
+    for row, action in ((3, "accept"), (7, "leave-out"), (3, "leave-out"), (-1, "undo"), (9, "accept"), (-1, "undo")):
+        decision = None if action == "undo" else desk.decision({"row": row, "action": action})
+        found = desk.take(lambda r, d=decision: r.without_last() if d is None else r.with_decision(d))
+        rows = [found["rows"].get(str(k), old) for k, old in enumerate(shown["rows"])]
+        decisions = [*shown["decisions"][: found["keep"]], *found["decisions"]]
+        shown = {"rows": rows, "result": found.get("result", shown["result"]), "decisions": decisions}
+        assert json.dumps(plain(shown)) == json.dumps(plain(state_view(desk.review)))
+
+
+def test_a_journal_that_another_changed_is_written_anew(desk):
+    for row in (3, 4):
+        decision = desk.decision({"row": row, "action": "accept"})
+        desk.take(lambda r, d=decision: r.with_decision(d))
+        desk.journal.unlink()
+    decision = desk.decision({"row": 5, "action": "accept"})
+    desk.take(lambda r: r.with_decision(decision))
+    assert [d.pose_id for d in read_decisions(desk.journal)] == ["p003", "p004", "p005"]

@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tomopose.calibration.records.decisions import Decision, write_decisions
+from tomopose.calibration.records.decisions import Decision, append_decision, write_decisions
 from tomopose.errors import EngineMissingError, InputError, TomoposeError
 from tomopose.files import plain
 from tomopose.io.images import ImageSequence
@@ -20,7 +20,7 @@ from tomopose.report.page import plots_script
 from tomopose.review.crops import crop
 from tomopose.review.guard import Guard
 from tomopose.review.session import Review, decision_about, measured_again
-from tomopose.review.view import figures_view, state_view, worst_first
+from tomopose.review.view import changes_view, figures_view, state_view, worst_first
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -50,6 +50,7 @@ class Desk:
     """What a running review works on: the one place that changes.  One decision is taken at a time.
 
     journal: review.jsonl;  save: writes the reviewed calibration and returns the names of what it wrote.
+    written, length: the decisions that this review last wrote into the journal, and its bytes then.
     """
 
     review: Review
@@ -60,19 +61,31 @@ class Desk:
     ball_diameter: float | None = None
     order: list[int] = field(default_factory=list)
     lock: threading.Lock = field(default_factory=threading.Lock)
+    written: tuple[Decision, ...] | None = None
+    length: int = -1
 
     def __post_init__(self) -> None:
         self.order = self.order or worst_first(self.review)
 
-    def take(self, changed: Callable[[Review], Review]) -> float:
-        """Change the review and its journal together, or neither; returns the seconds that it took to solve again."""
+    def take(self, changed: Callable[[Review], Review]) -> dict[str, Any]:
+        """Change the review and its journal together, or neither; returns what the page must change, with the time that
+        it took to solve again, ms."""
         with self.lock:
-            begun = time.perf_counter()
-            review = changed(self.review)
+            begun, before = time.perf_counter(), self.review
+            review = changed(before)
             seconds = time.perf_counter() - begun
-            write_decisions(self.journal, review.decisions)
+            self._write(review.decisions)
             self.review = review
-            return seconds
+            return {**changes_view(before, review), "solve_ms": 1000 * seconds}
+
+    def _write(self, decisions: tuple[Decision, ...]) -> None:
+        """A new decision is one more line of a journal that is as this review left it; else it is written anew."""
+        kept = self.journal.exists() and self.journal.stat().st_size == self.length
+        if kept and self.written is not None and decisions[:-1] == self.written:
+            append_decision(self.journal, decisions[-1])
+        else:
+            write_decisions(self.journal, decisions)
+        self.written, self.length = decisions, self.journal.stat().st_size
 
     def decision(self, content: Mapping[str, object]) -> Decision:
         """The decision that a page asks for.  InputError where it is not one; DetectionError where no ball is found."""
@@ -216,11 +229,9 @@ async def _change(desk: Desk, request: Request) -> Response:
             with desk.lock:
                 return {"written": desk.save(desk.review)}
         if what == "undo":
-            seconds = desk.take(lambda review: review.without_last())
-        else:
-            decision = desk.decision(content)
-            seconds = desk.take(lambda review: review.with_decision(decision))
-        return {**state_view(desk.review), "solve_ms": 1000 * seconds}
+            return desk.take(lambda review: review.without_last())
+        decision = desk.decision(content)
+        return desk.take(lambda review: review.with_decision(decision))
 
     try:
         return as_json(await run_in_threadpool(work, await _body(request)))

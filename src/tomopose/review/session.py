@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cached_property
 
 import numpy as np
 
@@ -38,7 +39,7 @@ class Review:
     calibration: Calibration
     solve: Solve
 
-    @property
+    @cached_property
     def observations(self) -> BallObservations:
         """After the decisions."""
         return decided(self.detected, self.decisions)

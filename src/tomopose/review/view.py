@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
 
+from tomopose.calibration.records.decisions import Decision
 from tomopose.calibration.result import Calibration
+from tomopose.observations import BallObservations
 from tomopose.report.figures import coverage_figures, residual_figures, scene_figures
 from tomopose.report.figures.thumbnails import ellipse_outline
 from tomopose.report.gather import join
@@ -32,15 +36,16 @@ def worst_first(review: Review) -> list[int]:
     return [int(k) for k in np.argsort(-np.where(np.isfinite(d), d, np.inf), kind="stable")]
 
 
-def rows_view(review: Review) -> list[dict[str, Any]]:
-    """One mapping a detection."""
+def rows_view(review: Review, which: Sequence[int] | None = None) -> list[dict[str, Any]]:
+    """One mapping a detection; of all of them, or of some rows."""
     o, cal = review.observations, review.calibration
     predicted, d = residual_lengths(review)
     usual = float(np.median(cal.d)) if len(cal.pose_id) else float("nan")
     used, last = set(cal.pose_id), {x.pose_id: x for x in review.decisions}
     sigma = np.linalg.norm(o.sigma, axis=1)
     out = []
-    for k, pose in enumerate(o.pose_id):
+    for k in range(len(o)) if which is None else which:
+        pose = o.pose_id[k]
         decision = last.get(pose)
         out.append(
             {
@@ -53,7 +58,7 @@ def rows_view(review: Review) -> list[dict[str, Any]]:
                 "predicted": predicted[k],
                 "d": d[k],
                 "times": d[k] / usual if usual > 0 else None,
-                "outline": _outline(review, k),
+                "outline": _outline(o, k),
                 "decision": None if decision is None else decision.action,
                 "words": "" if decision is None else decision.words,
             }
@@ -61,9 +66,8 @@ def rows_view(review: Review) -> list[dict[str, Any]]:
     return out
 
 
-def _outline(review: Review, k: int) -> list[float] | None:
+def _outline(o: BallObservations, k: int) -> list[float] | None:
     """Centre, semi axes and angle of the silhouette; None where none was found."""
-    o = review.observations
     if o.x_ellipse is None or o.semi_major is None or o.semi_minor is None:
         return None
     angle = 0.0 if o.angle is None or not np.isfinite(o.angle[k]) else float(o.angle[k])
@@ -102,10 +106,28 @@ def state_view(review: Review) -> dict[str, Any]:
     return {
         "rows": rows_view(review),
         "result": result_view(review.calibration),
-        "decisions": [
-            {"pose": d.pose_id, "words": d.words, "when": d.when, "action": d.action} for d in review.decisions
-        ],
+        "decisions": decisions_view(review.decisions),
     }
+
+
+def decisions_view(decisions: Sequence[Decision]) -> list[dict[str, str]]:
+    """Decisions as the page lists them, oldest first."""
+    return [{"pose": d.pose_id, "words": d.words, "when": d.when, "action": d.action} for d in decisions]
+
+
+def changes_view(before: Review, after: Review) -> dict[str, Any]:
+    """What the page of `before` must change to show `after`.
+
+    rows: by their number, those that differ: of a decision that left the calibration as it is, one;  result: where it
+    was solved again;  keep: how many of the decisions stay, oldest first, and decisions: those that follow.
+    """
+    keep = sum(1 for _ in takewhile(lambda p: p[0] is p[1], zip(before.decisions, after.decisions, strict=False)))
+    solved = after.calibration is not before.calibration
+    poses = {d.pose_id for d in (*before.decisions[keep:], *after.decisions[keep:])}
+    which = [k for k, pose in enumerate(after.detected.pose_id) if solved or pose in poses]
+    more = {"result": result_view(after.calibration)} if solved else {}
+    rows = {str(k): row for k, row in zip(which, rows_view(after, which), strict=True)}
+    return {"rows": rows, "keep": keep, "decisions": decisions_view(after.decisions[keep:]), **more}
 
 
 def figures_view(review: Review) -> list[dict[str, Any]]:

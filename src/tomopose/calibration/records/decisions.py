@@ -6,8 +6,10 @@ replayed from them and from the detections alone, without images, to the same by
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -192,6 +194,23 @@ def write_decisions(path: str | Path, decisions: Sequence[Decision]) -> None:
     write_text(path, "".join(to_line(d) + "\n" for d in decisions))
 
 
+def append_decision(path: str | Path, decision: Decision) -> None:
+    """Add one line to review.jsonl: all of it, on the disk, or none of it."""
+    line = (to_line(decision) + "\n").encode()
+    file = os.open(path, os.O_WRONLY | os.O_APPEND)
+    try:
+        before = os.fstat(file).st_size
+        try:
+            if os.write(file, line) != len(line):
+                raise OSError(errno.ENOSPC, "the line does not fit")
+            os.fsync(file)
+        except OSError as error:
+            os.truncate(path, before)
+            raise FileError(f"{path}: the decision cannot be written: {error}") from error
+    finally:
+        os.close(file)
+
+
 def decided(observations: BallObservations, decisions: Sequence[Decision]) -> BallObservations:
     """The observations after the decisions, which are taken in their order; without any, the same observations.
 
@@ -211,6 +230,7 @@ def decided(observations: BallObservations, decisions: Sequence[Decision]) -> Ba
         name: np.array(c) for name in OPTIONAL_COLUMNS if (c := getattr(observations, name)) is not None
     }
     ellipse = None if observations.x_ellipse is None else np.array(observations.x_ellipse)
+    usable = np.isfinite(x).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
     for pose, decision in last.items():
         if pose not in where:
             raise InputError(f"the review decides about pose {pose!r}, which has no observation")
@@ -220,7 +240,7 @@ def decided(observations: BallObservations, decisions: Sequence[Decision]) -> Ba
             seen[k] = False
             status[k] = decision.words
         elif decision.action == "accept":
-            seen[k] = bool(np.isfinite(x[k]).all() and np.isfinite(covariance[k]).all())
+            seen[k] = usable[k]
             status[k] = f"{status[k]}; {decision.words}" if seen[k] else status[k]
         elif decision.measured is not None:
             m = decision.measured
@@ -237,8 +257,10 @@ def decided(observations: BallObservations, decisions: Sequence[Decision]) -> Ba
 
 def _require_same(decision: Decision, observations: BallObservations, k: int) -> None:
     now, judged = observations.x_D[k], decision.judged
-    measured = bool(np.isfinite(now).all())
-    if measured != (judged is not None) or (judged is not None and np.abs(now - judged).max() > SAME_PX):
+    measured = math.isfinite(now[0]) and math.isfinite(now[1])
+    if measured != (judged is not None) or (
+        judged is not None and max(abs(now[0] - judged[0]), abs(now[1] - judged[1])) > SAME_PX
+    ):
         shown = "nothing was measured" if judged is None else f"u {judged[0]:.4f}, v {judged[1]:.4f} px"
         here = f"u {now[0]:.4f}, v {now[1]:.4f} px" if measured else "nothing is measured"
         raise InputError(

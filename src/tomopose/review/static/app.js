@@ -130,12 +130,19 @@ function nextUndecided() {
   go(i === undefined ? place + 1 : i);
 }
 
+/* An answer holds what changed: rows by number, decisions after those that stay, a result where it was solved again. */
+function merge(found) {
+  const rows = state.rows.slice();
+  Object.entries(found.rows).forEach(([k, row]) => { rows[k] = row; });
+  state = { ...state, rows, decisions: [...state.decisions.slice(0, found.keep), ...found.decisions], result: found.result ?? state.result };
+}
+
 /* Changes are sent one after the other; the keyboard is never held up by them. */
 function change(path, content, done) {
   busy += 1;
   document.body.dataset.busy = String(busy);
   queue = queue.then(() => ask(path, content)).then((found) => {
-    if (found.rows) { state = { ...state, ...found }; showRows(); showRow(); showResult(); say(`solved again in ${found.solve_ms.toFixed(0)} ms`); }
+    if (found.rows) { merge(found); showRows(); showRow(); showResult(); say(`solved again in ${found.solve_ms.toFixed(0)} ms`); }
     if (done) done(found);
   }).catch((error) => say(error.message)).finally(() => {
     busy -= 1;
