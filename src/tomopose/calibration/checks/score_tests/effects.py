@@ -316,7 +316,7 @@ def _drifts(problem: Problem, b: ProjectionBlocks) -> list[Columns]:
             ("ball drift", "drift of the ball", "the ball drifts by {:.2g} um over the run", 1000.0, b.J_t_HT),
         ):
             effect = _length(name if order > 1 else f"{name}, {ending}", "time", short, text, factor, order)
-            px = _over_time(base, course[:, : order + 1])
+            px = _over_time(base, np.asarray(course[:, : order + 1], dtype=np.float64))
             found.append(Columns(effect=effect, px=px, constant=base.shape[2]))
     return found
 

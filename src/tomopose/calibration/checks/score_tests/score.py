@@ -79,10 +79,10 @@ def whitened(problem: Problem, free: FreeParameters, fit: Fit, b: ProjectionBloc
 
 def triangle(blocks_of_rows: Iterable[Array]) -> Array:
     """(c, c), or fewer rows: vectors with the inner products of the columns of all rows (k, c) together."""
-    found = np.zeros((0, 0))
+    found: Array = np.zeros((0, 0))
     for rows in blocks_of_rows:
         together = rows if not found.size else np.concatenate([found, rows])
-        found = np.linalg.qr(together, mode="r") if len(together) > together.shape[1] else together
+        found = np.asarray(np.linalg.qr(together, mode="r")) if len(together) > together.shape[1] else together
     return found
 
 
