@@ -1,7 +1,7 @@
 """How good planned scans are: certificates, the worth beside other paths, time, and lengths from virtual scans.
 
     python benchmarks/planning/run.py                   certificates and worth of five parts, time of a large one
-    python benchmarks/planning/run.py --images plate    also virtual scans: errors of lengths beside the usual paths
+    python benchmarks/planning/run.py --images plate --views 24    virtual scans: errors of lengths by path
 
 Random paths are N of the candidates, the best of ten draws.  Judged on points that nothing was planned with, counting
 what leaves the view as if it did not: that favours the usual paths.
@@ -23,7 +23,7 @@ from tomopose.planning.part.worth import worth
 from tomopose.planning.part_scan.limits_file import ScanLimits, default_travel
 from tomopose.planning.part_scan.plan import PartScanPlan, plan_part_scan
 from tomopose.planning.part_scan.setting import Setting
-from tomopose.planning.part_scan.stations import allowed, stations
+from tomopose.planning.part_scan.stations import allowed
 from tomopose.trajectory.feasibility import TravelLimits, beyond_travel
 
 DRAWS = 10
@@ -51,7 +51,7 @@ def setting(case: Case, views: int) -> Setting:
 def random_J(task: Setting, plan: PartScanPlan) -> float:
     """The best of ten random draws of the candidates."""
     rng, machine = np.random.default_rng(0), task.machine
-    q = stations(machine, task.part, task.settings)
+    q, _ = task.candidates(plan.goal)
     draws = (q[rng.choice(len(q), len(plan), replace=False)] for _ in range(DRAWS))
     return max(worth(plan.goal, machine.matrices(rows)).J for rows in draws)
 
@@ -114,14 +114,17 @@ def large() -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", type=int, default=40)
-    parser.add_argument("--images", help="also virtual scans of this part")
+    parser.add_argument("--images", choices=[n for n, make in CASES.items() if make().plan], help="virtual scans only")
+    parser.add_argument("--draws", type=int, default=6, help="virtual scans of each path")
     given = parser.parse_args()
-    worth_table(given.views)
-    large()
     if given.images:
         from scans import compare
 
-        compare(CASES[given.images](), setting(CASES[given.images](), given.views))
+        case = CASES[given.images]()
+        compare(case, setting(case, given.views), given.draws)
+    else:
+        worth_table(given.views)
+        large()
 
 
 if __name__ == "__main__":

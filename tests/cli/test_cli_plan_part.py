@@ -133,3 +133,27 @@ def test_the_defaults_of_the_options_are_those_of_the_library():
         assert getattr(options, option) == pytest.approx(np.degrees(there) if degrees else there), option
     for option in ("quanta", "blur", "seed"):
         assert getattr(options, option) == getattr(settings, option), option
+
+
+def test_a_continuous_scan_writes_its_way_and_says_whether_fdk_follows_it(words, tmp_path, capsys):
+    (tmp_path / "limits.toml").write_text("[travel]\nz_mm = [0, 0.5]\nrx_deg = [-3, 3]\nry_deg = [-3, 3]\n")
+    assert run([*words, "--mu-per-mm", "0.05", "--views", "16", "--continuous"]) == 0
+    assert "FDK follows this path" in capsys.readouterr().out
+    assert json.loads((tmp_path / "scan.json").read_text())["fdk"] == {"possible": True, "why": ""}
+    way = tp.read_poses(tmp_path / "scan.way.csv")
+    assert np.degrees(np.diff(way.alpha)).max() <= 0.5 + 1e-9
+
+
+def test_a_manipulator_without_stroke_or_a_robot_is_refused(words, tmp_path, capsys):
+    joints = {"a_mm": 100, "alpha_deg": 90, "d_mm": 10}
+    angle = np.radians([0, 60, 120, 180, 240, 300])
+    ring = np.column_stack([100 * np.cos(angle), 100 * np.sin(angle), np.full(6, -200.0)])
+    plates = {"base_joints_mm": ring.tolist(), "platform_joints_mm": (0.6 * ring).tolist()}
+    for content, match in (
+        ({"schema": "tomopose/hexapod/1", **plates}, "leg_limits_mm is missing"),
+        ({"schema": "tomopose/serial/1", "convention": "dh", "joints": [joints] * 6}, "describes a robot"),
+    ):
+        (tmp_path / "machine.json").write_text(json.dumps(content))
+        assert run([*words, "--mu-per-mm", "0.05", "--manipulator", str(tmp_path / "machine.json")]) == 1
+        assert match in capsys.readouterr().err
+        assert not list(tmp_path.glob("scan.*"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,19 +12,21 @@ import pytest
 import tomopose as tp
 from tomopose.errors import InputError, OutOfReachError
 from tomopose.geometry.rotations import R_z
+from tomopose.manipulator.hexapod import Hexapod
 from tomopose.measurement.mesh.mesh import Mesh
 from tomopose.measurement.plan import plan_from
+from tomopose.planning.part.keep_out import Obstacle
 from tomopose.planning.part.material_paths import material_paths
 from tomopose.planning.part.part import Part, require_simple
 from tomopose.planning.part.settings import PartSettings
 from tomopose.planning.part.worth import Goal, sources, table, worth
 from tomopose.planning.part_scan.choose import choose, dual_bound, value
-from tomopose.planning.part_scan.keep_out import Obstacle
 from tomopose.planning.part_scan.limits_file import ScanLimits, default_travel, read_limits
 from tomopose.planning.part_scan.plan import plan_part_scan
 from tomopose.planning.part_scan.setting import Setting
 from tomopose.planning.part_scan.stations import allowed
 from tomopose.planning.part_scan.visit import travel, visiting_order
+from tomopose.reconstruction.choice import path_obstacle
 from tomopose.trajectory.feasibility import TravelLimits
 
 HALF = np.array([9.0, 7.0, 2.5])
@@ -302,3 +305,72 @@ def test_a_time_limit_leaves_out_the_least_useful_views(small_scanner):
     assert short.dropped[0] > 0
     assert short.chosen.duration <= 0.6 * free.chosen.duration
     assert short.dropped[1] > 0
+
+
+def hexapod(limits: tuple[float, float]) -> Hexapod:
+    angle = np.radians([-10, 10, 110, 130, 230, 250])
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(6)])
+    platform = np.radians([-50, 50, 70, 170, 190, 290])
+    top = np.column_stack([np.cos(platform), np.sin(platform), np.zeros(6)])
+    joints = {"base_joints": 120 * ring - [0, 0, 200.0], "platform_joints": 80 * top - [0, 0, 20.0]}
+    return Hexapod(**joints, leg_limits=limits)
+
+
+def test_a_continuous_scan_is_one_smooth_turn_that_fdk_follows(small_scanner):
+    plan = plan_part_scan(setting(small_scanner, views=24, continuous=True))
+    assert path_obstacle(plan.matrices) == ""
+    np.testing.assert_allclose(np.diff(plan.poses.alpha), 2 * math.pi / 24, atol=1e-9)
+    assert plan.chosen.worth.J > plan.paths["circular"].worth.J
+    assert plan.planned_J <= plan.bound
+    low, high = plan.limits.travel.low[:6] - 1e-9, plan.limits.travel.high[:6] + 1e-9
+    assert ((plan.way[:, :6] >= low) & (plan.way[:, :6] <= high)).all()
+    # the way leads through the views
+    for q in plan.chosen.q:
+        assert np.abs(plan.way - q).max(axis=1).min() < math.radians(0.5)
+    scattered = plan_part_scan(setting(small_scanner, views=24))
+    assert path_obstacle(scattered.matrices) != ""
+
+
+def test_the_legs_of_a_hexapod_stay_within_their_stroke(small_scanner):
+    machine = hexapod((100.0, 400.0))
+    task = setting(small_scanner, manipulator=machine)
+    free = plan_part_scan(task)
+    T = free.poses.T_MH
+    legs = machine.leg_lengths(T.R, T.t)
+    home = machine.leg_lengths(np.eye(3)[None], np.zeros((1, 3)))
+    stroke = 0.5 * float(np.abs(legs - home).max())
+    narrow = hexapod((float(home.min()) - stroke, float(home.max()) + stroke))
+    assert not narrow.reaches(T.R, T.t).all()
+    T = plan_part_scan(setting(small_scanner, manipulator=narrow)).poses.T_MH
+    assert narrow.reaches(T.R, T.t).all()
+    assert (np.abs(narrow.leg_lengths(T.R, T.t) - home) <= stroke + np.ptp(home) + 1e-9).all()
+    with pytest.raises(OutOfReachError, match="legs leave their stroke"):
+        plan_part_scan(setting(small_scanner, manipulator=hexapod((10.0, 20.0))))
+
+
+def test_every_view_keeps_to_the_least_transmission_that_is_asked_for(small_scanner):
+    task = setting(small_scanner)
+    goal = task.goal()
+    q, tables = task.candidates(goal)
+    asked = float(np.quantile(tables.M, 0.6))
+    dense = setting(small_scanner, settings=replace(task.settings, least_view_transmission=asked))
+    kept, _ = dense.candidates(goal)
+    assert len(kept) < len(q)
+    plan = plan_part_scan(dense)
+    assert table(goal, plan.machine.matrices(plan.chosen.q)).M.min() >= asked
+    with pytest.raises(OutOfReachError, match="no view of"):
+        setting(small_scanner, settings=replace(task.settings, least_view_transmission=0.999)).candidates(goal)
+
+
+def test_a_box_in_the_limits_is_the_closed_mesh_of_its_corners(tmp_path):
+    path = tmp_path / "limits.toml"
+    path.write_text('[keep_out]\nplate = {box = [[-3, -2, -1], [3, 4, 5]], frame = "T"}\n')
+    (found,) = read_limits(path).obstacles
+    assert found.frame == "T"
+    assert not found.mesh.open_edges
+    a, b, c = (found.mesh.points[found.mesh.faces[:, k]] for k in range(3))
+    assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 == pytest.approx(6 * 6 * 6)
+    for wrong in ("[[3, -2, -1], [-3, 4, 5]]", "[[0, 0], [1, 1]]", '"big"', "[[0, 0, nan], [1, 1, 1]]"):
+        path.write_text(f"[keep_out]\nplate = {{box = {wrong}}}\n")
+        with pytest.raises(InputError, match="box"):
+            read_limits(path)

@@ -17,6 +17,7 @@ from tomopose.cli.plan_poses import SUFFIXES
 
 if TYPE_CHECKING:
     from tomopose import Calibration, PoseSequence, Scanner
+    from tomopose.manipulator.hexapod import Hexapod
     from tomopose.planning.part.settings import PartSettings
     from tomopose.planning.part_scan.freedoms import Freedom, Placing
     from tomopose.planning.part_scan.plan import PartScanPlan
@@ -83,6 +84,9 @@ class PartOptions:
     least_transmission: Annotated[
         float, typer.Option("--least-transmission", help="Below it a ray shows nothing of a surface.")
     ] = 0.05
+    least_view_transmission: Annotated[
+        float, typer.Option("--least-view-transmission", help="Mean that every view has to have; 0 admits all.")
+    ] = 0.0
     tangent: Annotated[
         float, typer.Option("--tangent-deg", help="How near to the tangent plane a ray shows a surface.")
     ] = 1.5
@@ -92,6 +96,12 @@ class PartOptions:
         20_000.0
     )
     blur: Annotated[float, typer.Option("--blur-px", help="Standard width of the unsharpness at the panel.")] = 0.5
+    manipulator: Annotated[
+        Path | None, typer.Option("--manipulator", help="hexapod.json: its legs have to stay within their stroke.")
+    ] = None
+    continuous: Annotated[
+        bool, typer.Option("--continuous", help="Views on one smooth turn, without stops; also writes scan.way.csv.")
+    ] = False
     placing: Annotated[bool, typer.Option("--placing", help="Also search how to place the part on the plate.")] = False
     seed: Annotated[int, typer.Option("--seed", help="Random seed for the points of the whole surface.")] = 0
 
@@ -212,6 +222,7 @@ def _settings(o: Options, mu: float) -> PartSettings:
     return PartSettings(
         mu=mu,
         least_transmission=o.least_transmission,
+        least_view_transmission=o.least_view_transmission,
         tangent=math.radians(o.tangent),
         tuy_width=math.radians(o.tuy),
         margin=o.margin,
@@ -233,6 +244,24 @@ def _scanner(o: Options, cal: Calibration | None) -> Scanner:
     if given is not None:
         require_same_scanner(cal, given)
     return cal.scanner
+
+
+def _hexapod(o: Options) -> Hexapod | None:
+    import tomopose as tp
+    from tomopose.errors import InputError
+    from tomopose.manipulator.hexapod import Hexapod
+
+    if o.manipulator is None:
+        return None
+    found = tp.read_manipulator(o.manipulator)
+    if not isinstance(found, Hexapod):
+        raise InputError(
+            f"{o.manipulator}: a scan of a part is planned for a hexapod, whose zero is the middle of its travel; this "
+            "file describes a robot"
+        )
+    if found.leg_limits is None:
+        raise InputError(f"{o.manipulator}: leg_limits_mm is missing; without it nobody knows the stroke of the legs")
+    return found
 
 
 def _planned(o: Options) -> int:
@@ -258,6 +287,8 @@ def _planned(o: Options) -> int:
         features=None if o.features is None else read_plan(o.features),
         limits=ScanLimits() if o.limits is None else read_limits(o.limits),
         calibration=cal,
+        manipulator=_hexapod(o),
+        continuous=o.continuous,
     )
     placing = None
     if o.placing:
@@ -271,8 +302,10 @@ def _planned(o: Options) -> int:
 
 
 def _beside(o: Options) -> list[Path]:
-    """scan.csv, scan.json, scan.html and the machine's own list, if one is wanted."""
+    """scan.csv, scan.json, scan.html, the way of a continuous scan, and the machine's own list, if one is wanted."""
     paths = [o.out, o.out.with_suffix(".json"), o.out.with_suffix(".html")]
+    if o.continuous:
+        paths.append(o.out.with_suffix(".way.csv"))
     if o.commands is not None:
         if o.commands not in SUFFIXES:
             raise typer.BadParameter(
@@ -280,6 +313,15 @@ def _beside(o: Options) -> list[Path]:
             )
         paths.append(o.out.with_suffix(SUFFIXES[o.commands]))
     return paths
+
+
+def _fdk(plan: PartScanPlan) -> tuple[dict[str, object], str]:
+    """(what scan.json holds, in words): whether FDK follows this path of the source."""
+    from tomopose.reconstruction.choice import path_obstacle
+
+    why = path_obstacle(plan.matrices)
+    words = f"FDK is not defined along this path: {why}; reconstruct with sart" if why else "FDK follows this path"
+    return {"possible": not why, "why": why}, words
 
 
 def _write(o: Options, plan: PartScanPlan, attenuation: str, free: Sequence[Freedom], placing: Placing | None) -> None:
@@ -294,6 +336,7 @@ def _write(o: Options, plan: PartScanPlan, attenuation: str, free: Sequence[Free
     document = plan_document(plan)
     document["attenuation"] = attenuation
     document["freedoms"] = [{"name": f.name, "J": f.J, "gain": f.gain} for f in free]
+    document["fdk"], fdk = _fdk(plan)
     document["placing"] = None if placing is None else placing.document()
     mesh = plan.goal.part.mesh
     surface = PartSurface.of(mesh.points, mesh.faces, plan.goal.x, plan.chosen.seen)
@@ -302,11 +345,13 @@ def _write(o: Options, plan: PartScanPlan, attenuation: str, free: Sequence[Free
     tp.write_poses(paths[0], plan.poses, force=o.force)
     write_json(paths[1], "scan-plan", document)
     write_report(paths[2], page)
+    if plan.way is not None:
+        tp.write_poses(paths[3], plan.machine.poses(plan.way), force=o.force)
     if o.commands is not None:
-        write_text(paths[3], command_list(plan.poses, o.commands))
+        write_text(paths[-1], command_list(plan.poses, o.commands))
     lines = [f"{o.out}: {len(plan)} views of {plan.goal.part.name}; attenuation {attenuation}"]
     if placing is not None:
         best = max(placing.tried, key=lambda name: placing.tried[name])
         lines.append(f"  place the part {best} ({len(placing.tried)} placings tried); the views hold for that placing")
     helps = [f"  with {f.name}: {100 * f.gain:+.0f} % of J" for f in free[:3]]
-    o.say.result({"out": o.out.name, **document}, [*lines, *plan_lines(plan), *helps])
+    o.say.result({"out": o.out.name, **document}, [*lines, *plan_lines(plan), f"  {fdk}", *helps])

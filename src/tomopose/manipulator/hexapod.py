@@ -247,17 +247,16 @@ class Hexapod:
         Without stated limits none may grow beyond twice its length at home or shrink below half of it, since a spindle
         is no longer than its tube, and none may lean over by a right angle from where it points at home.
         """
-        home, A_home = self.legs(np.eye(3)[None], np.zeros((1, 3)))
-        leaning = np.flatnonzero((np.einsum("nki,ki->nk", direction, A_home[0, :, 3:]) <= 0).any(axis=1))
+        leaning = np.flatnonzero(self._leans(direction))
         if leaning.size:
             raise OutOfReachError(
                 f"{leaning.size} poses make a leg lean by more than 90 deg from home; the first is pose {leaning[0]}: "
                 "this platform cannot take them; check the joints' order, signs and units",
                 indices=leaning.tolist(),
             )
-        low, high = self.leg_limits or (home[0] / LARGEST_STROKE, home[0] * LARGEST_STROKE)
-        bad = np.flatnonzero(((legs < low) | (legs > high)).any(axis=1))
+        bad = np.flatnonzero(self._beyond_stroke(legs))
         if bad.size:
+            home = self._home[0]
             limits = f"half or twice their length at home ({home.min():.1f} to {home.max():.1f} mm)"
             if self.leg_limits is not None:
                 limits = "{:g} to {:g} mm".format(*self.leg_limits)
@@ -267,6 +266,26 @@ class Hexapod:
                 indices=bad.tolist(),
                 limits=self.leg_limits,
             )
+
+    @cached_property
+    def _home(self) -> tuple[Array, Array]:
+        """Legs (1, 6), mm, and A (1, 6, 6) at zero."""
+        return self.legs(np.eye(3)[None], np.zeros((1, 3)))
+
+    def _leans(self, direction: Array) -> np.ndarray:
+        """(n,) bool: a leg, directions (n, 6, 3), leans over by a right angle from where it points at home."""
+        return np.asarray(np.any(np.einsum("nki,ki->nk", direction, self._home[1][0, :, 3:]) <= 0, axis=1))
+
+    def _beyond_stroke(self, legs: Array) -> np.ndarray:
+        """(n,) bool: a leg (n, 6), mm, is shorter or longer than it can be."""
+        home = self._home[0][0]
+        low, high = self.leg_limits or (home / LARGEST_STROKE, home * LARGEST_STROKE)
+        return np.asarray(np.any((legs < low) | (legs > high), axis=1))
+
+    def reaches(self, R: Array, t: Array) -> np.ndarray:
+        """(n,) bool: the nominal platform takes the poses R (n, 3, 3), t (n, 3), mm, with its legs in their stroke."""
+        legs, A = self.legs(R, t)
+        return np.asarray(~(self._leans(A[:, :, 3:]) | self._beyond_stroke(legs)))
 
     @property
     def groups(self) -> Any:

@@ -9,7 +9,8 @@ import numpy as np
 
 from tomopose.engines.protocol import Limits
 from tomopose.errors import EngineError, TrajectoryError
-from tomopose.reconstruction.fdk.path import SourcePath, source_path
+from tomopose.geometry.projection import ProjectionMatrices
+from tomopose.reconstruction.fdk.path import SourcePath, height_obstacle, holes_obstacle, source_path
 from tomopose.reconstruction.fdk.redundancy import Fan, Redundancy, fan_of, lines_missing, reach_of
 from tomopose.reconstruction.line_integrals import LineIntegrals
 from tomopose.reconstruction.settings import FDK, SART, Algorithm, name_of
@@ -118,13 +119,9 @@ def fdk_obstacle(s: Situation) -> str:
     """Why FDK is not defined here, in words; empty where it is."""
     if s.path is None or s.fan is None:
         return f"{s.n} views do not determine a path of the source"
-    if s.n < FEWEST_FOR_FDK * s.path.coverage / (2 * math.pi):
-        return f"{s.n} views are too few: below {FEWEST_FOR_FDK} a turn its sum over the views is no integral any more"
-    if not s.path.smooth:
-        return (
-            "it follows the source's path from view to view about the axis, and here the height of the source jumps "
-            "between neighbours by angle (several rings, or scattered views)"
-        )
+    on_way = _few_or_rough(s.n, s.path)
+    if on_way:
+        return on_way
     if s.fan.overlap <= 0:
         return "the panel does not see the axis of the path in every view"
     if s.cut_long > CUT_ROWS:
@@ -137,16 +134,26 @@ def fdk_obstacle(s: Situation) -> str:
     return short_scan_obstacle(s, s.path)
 
 
+def _few_or_rough(n: int, path: SourcePath) -> str:
+    if n < FEWEST_FOR_FDK * path.coverage / (2 * math.pi):
+        return f"{n} views are too few: below {FEWEST_FOR_FDK} a turn its sum over the views is no integral any more"
+    return height_obstacle(path)
+
+
+def path_obstacle(matrices: ProjectionMatrices) -> str:
+    """Why FDK cannot follow the source along these views, whatever the panel sees, in words; empty where it can."""
+    path = source_path(matrices)
+    if path is None:
+        return f"{len(matrices)} views do not determine a path of the source"
+    return _few_or_rough(len(matrices), path) or holes_obstacle(path)
+
+
 def short_scan_obstacle(s: Situation, path: SourcePath) -> str:
     """Why FDK is not defined on a path with holes, in words; empty where it is."""
     covered = math.degrees(path.coverage)
-    if len(path.holes) > 1:
-        return f"the turn has {len(path.holes)} stretches without views, {360 - covered:.0f} degrees together"
-    if not path.circular:
-        return (
-            f"the source covers {covered:.0f} of 360 degrees and leaves the plane of its path: weights for a short "
-            "scan are defined on a circle"
-        )
+    holes = holes_obstacle(path)
+    if holes:
+        return holes
     if lines_missing(path, s.needed):
         return (
             f"the source covers {covered:.0f} degrees, and every line through the grid is measured from "

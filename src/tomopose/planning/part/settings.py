@@ -37,6 +37,7 @@ class PartSettings:
 
     mu:                 linear attenuation coefficient of the part, 1/mm.
     least_transmission: below it a ray holds no information on a surface.
+    least_view_transmission:  mean over the points that a view has to have to be a candidate; 0 admits all.
     tangent:            rad; a ray within this angle of the surface's tangent plane shows where the surface is.
     tuy_width:          rad; standard width of the soft condition of Tuy.
     margin:             px that the whole part keeps from the panel's edge.
@@ -48,6 +49,7 @@ class PartSettings:
 
     mu: float
     least_transmission: float = 0.05
+    least_view_transmission: float = 0.0
     tangent: float = math.radians(1.5)
     tuy_width: float = math.radians(3.0)
     margin: float = 2.0
@@ -65,6 +67,10 @@ class PartSettings:
                 raise InputError(f"{name} is {found}; a positive number is needed")
         if not 0 < self.least_transmission < 1:
             raise InputError(f"least_transmission is {self.least_transmission}; a share between 0 and 1 is needed")
+        if not 0 <= self.least_view_transmission < 1:
+            raise InputError(
+                f"least_view_transmission is {self.least_view_transmission}; a share from 0 to below 1 is needed"
+            )
         for name in ("margin", "readout", "blur"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise InputError(f"{name} is {getattr(self, name)}; a number from 0 is needed")

@@ -16,11 +16,9 @@ from tomopose.measurement.mesh.mesh import Mesh
 from tomopose.measurement.plan import MeasurementPlan
 from tomopose.planning.part.part import Part
 from tomopose.planning.part.settings import WEIGHTS
-from tomopose.planning.part.worth import table
 from tomopose.planning.part_scan.choose import choose, value
 from tomopose.planning.part_scan.limits_file import ScanLimits
 from tomopose.planning.part_scan.setting import Setting
-from tomopose.planning.part_scan.stations import stations
 from tomopose.trajectory.feasibility import TravelLimits
 from tomopose.units import Array
 
@@ -67,13 +65,12 @@ def coarse_J(setting: Setting) -> float:
     """J of a coarse search; 0 where nothing is allowed."""
     s = setting.settings
     coarse = replace(setting, settings=replace(s, alpha_step=COARSE * s.alpha_step, tilt_step=COARSE * s.tilt_step))
-    goal, machine = coarse.goal(), coarse.machine
+    goal = coarse.goal()
     try:
-        q = stations(machine, coarse.part, coarse.settings)
+        q, tables = coarse.candidates(goal)
     except OutOfReachError:
         return 0.0
     N = min(coarse.views, len(q))
-    tables = table(goal, machine.matrices(q))
     m = WEIGHTS[2] * tables.M / N
     return value(tables.A, m, goal.w, choose(tables.A, m, goal.w, N))
 

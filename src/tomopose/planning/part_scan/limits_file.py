@@ -6,6 +6,7 @@ x_mm = [-10, 10]            # y_mm, z_mm, rx_deg, ry_deg, rz_deg, alpha_deg
 speed_mm_s = 2              # speed_deg_s, settle_s, image_s, limit_s
 [keep_out]
 tube = {file = "tube.stl", frame = "W"}
+plate = {box = [[-60, -60, -40], [60, 60, -25]], frame = "T"}      # lower and upper corner, mm
 """
 
 from __future__ import annotations
@@ -15,10 +16,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from tomopose.errors import FileError, InputError
+from tomopose.geometry.box import BOX_CORNERS
+from tomopose.measurement.mesh.mesh import Mesh
 from tomopose.measurement.mesh.mesh_files import read_mesh
-from tomopose.planning.part_scan.keep_out import Obstacle
+from tomopose.planning.part.keep_out import Obstacle
 from tomopose.reading import parse_toml, read_text, reader
 from tomopose.trajectory.feasibility import TravelLimits
 
@@ -110,12 +114,33 @@ def _time(given: dict[str, object]) -> MoveTime:
 
 
 def _obstacle(name: str, given: object, folder: Path) -> Obstacle:
-    if not isinstance(given, dict) or not isinstance(given.get("file"), str) or set(given) - {"file", "frame"}:
-        raise InputError(f'limits: [keep_out] {name} is {given!r}; {{file = "tube.stl", frame = "W"}} is needed')
+    keys = set(given) - {"frame"} if isinstance(given, dict) else set()
+    if not isinstance(given, dict) or keys not in ({"file"}, {"box"}) or not isinstance(given.get("file", ""), str):
+        raise InputError(
+            f'limits: [keep_out] {name} is {given!r}; {{file = "tube.stl", frame = "W"}} or {{box = [[x, y, z], '
+            '[x, y, z]], frame = "W"}, with the lower and the upper corner in mm, is needed'
+        )
     frame = given.get("frame", "W")
     if frame not in ("W", "T"):
         raise InputError(f"limits: [keep_out] {name}: frame is {frame!r}; W (fixed) or T (on the table) is needed")
-    return Obstacle(name=name, mesh=read_mesh(folder / given["file"]), frame=frame)
+    mesh = _box(name, given["box"]) if "box" in given else read_mesh(folder / given["file"])
+    return Obstacle(name=name, mesh=mesh, frame=frame)
+
+
+def _box(name: str, given: object) -> Mesh:
+    """The twelve triangles of a box from its lower and upper corner."""
+    try:
+        corners = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        corners = np.full((2, 3), np.nan)
+    if corners.shape != (2, 3) or not np.isfinite(corners).all() or (corners[0] >= corners[1]).any():
+        raise InputError(
+            f"limits: [keep_out] {name}: box is {given!r}; [[x, y, z], [x, y, z]], lower corner first, is needed"
+        )
+    hull = ConvexHull(corners.mean(axis=0) + BOX_CORNERS * np.ptp(corners, axis=0) / 2)
+    a, b, c = (hull.points[hull.simplices[:, k]] for k in range(3))
+    inwards = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    return Mesh(points=hull.points, faces=np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices))
 
 
 @reader("limits")

@@ -33,6 +33,10 @@ def refine_off_grid(goal: Goal, machine: Machine, q: Array, views: Views) -> tup
             if not len(around):
                 continue
             tried = table(goal, machine.matrices(around))
+            clear = s.least_view_transmission <= tried.M
+            if not clear.any():
+                continue
+            around, tried = around[clear], tried.take(clear)
             gains = np.maximum(tried.A - base, 0) @ w + WEIGHTS[2] * tried.M / n
             own = float(np.maximum(A[i] - base, 0) @ w) + WEIGHTS[2] * float(tau[i].mean()) / n
             k = int(np.argmax(gains))

@@ -9,17 +9,19 @@ import numpy as np
 
 from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.errors import InputError
+from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.planning.part.predict import Predicted, measurand_u, predicted, shared_part, why_unseen
 from tomopose.planning.part.settings import WEIGHTS, PartSettings
 from tomopose.planning.part.worth import Goal, Views, Worth, sources, table, worth
 from tomopose.planning.part_scan.choose import choose, dual_bound, value
+from tomopose.planning.part_scan.continuous import fine_path, of_one_turn, smooth_turn
 from tomopose.planning.part_scan.limits_file import ScanLimits
 from tomopose.planning.part_scan.off_grid import refine_off_grid
 from tomopose.planning.part_scan.paths import usual_paths
 from tomopose.planning.part_scan.setting import Setting
-from tomopose.planning.part_scan.stations import Machine, allowed, stations
-from tomopose.planning.part_scan.visit import duration, travel, visiting_order
+from tomopose.planning.part_scan.stations import Machine, allowed
+from tomopose.planning.part_scan.visit import duration, travel, turn_duration, visiting_order
 from tomopose.units import Array
 
 Progress = Callable[[str], None]
@@ -56,6 +58,8 @@ class PartScanPlan:
     unseen:    feature -> why no allowed view shows some of it, and what would.
     goal:      the points that all paths were judged on.
     dropped:   views left out to keep the time limit, with the J that they would have added.
+    way:       (k, 7) axes of the smooth way through the views of a continuous scan;  way_blocked: how many of those
+               places leave the view, an axis' limits or the stroke, or hit an obstacle.
     """
 
     poses: PoseSequence
@@ -70,9 +74,20 @@ class PartScanPlan:
     machine: Machine
     limits: ScanLimits
     dropped: tuple[int, float]
+    way: Array | None = None
+    way_blocked: int = 0
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    @property
+    def matrices(self) -> ProjectionMatrices:
+        """Of the views, in their order."""
+        s = self.machine.scanner
+        P = self.machine.matrices(self.chosen.q)
+        return ProjectionMatrices(
+            P=P, n_u=s.n_u, n_v=s.n_v, p_u=s.p_u, p_v=s.p_v, pose_id=self.poses.pose_id, scanner=s
+        )
 
     @property
     def source_path(self) -> Array:
@@ -95,23 +110,31 @@ def plan_part_scan(setting: Setting, *, progress: Progress = _silent) -> PartSca
     candidates than views.
     """
     machine, goal, views = setting.machine, setting.goal(), setting.views
-    progress("candidates within the limits, in view and clear")
-    q_all = stations(machine, setting.part, setting.settings)
+    setting = of_one_turn(setting) if setting.continuous else setting
+    progress("candidates within the limits, in view and clear, and their transmission")
+    q_all, tables = setting.candidates(goal)
     if len(q_all) < views:
         raise InputError(
             f"{views} views are wanted and only {len(q_all)} candidates are allowed; widen the limits, or ask for "
             "fewer views"
         )
-    progress(f"transmission of {len(q_all)} candidates at {len(goal.x) + len(goal.x_tuy)} points")
-    tables = table(goal, machine.matrices(q_all))
     progress(f"choosing {views} of {len(q_all)}")
     m = WEIGHTS[2] * tables.M / views
-    rows = choose(tables.A, m, goal.w, views)
-    progress("moving the chosen views off the grid")
-    q, fine = refine_off_grid(goal, machine, q_all[rows], tables.take(rows))
+    if setting.continuous:
+        rows = smooth_turn(setting, q_all, machine.matrices(q_all), tables, m, goal.w)
+        q, fine = q_all[rows], tables.take(rows)
+    else:
+        rows = choose(tables.A, m, goal.w, views)
+        progress("moving the chosen views off the grid")
+        q, fine = refine_off_grid(goal, machine, q_all[rows], tables.take(rows))
     progress("bounding what any choice could reach")
     reached, bound = _certificate(goal, tables, fine, views)
-    q, dropped = _within_time(machine, setting.limits, goal, q, fine)
+    if setting.continuous:
+        dropped = 0, 0.0
+        _require_time(turn_duration(machine, setting.limits.time, q), setting.limits, views)
+    else:
+        q, dropped = _within_time(machine, setting.limits, goal, q, fine)
+    way = fine_path(machine, q) if setting.continuous else None
     progress("judging the plan and the usual paths on other points")
     judge = _Judge(goal=setting.goal(judged=True), machine=machine, setting=setting)
     return PartScanPlan(
@@ -127,6 +150,8 @@ def plan_part_scan(setting: Setting, *, progress: Progress = _silent) -> PartSca
         machine=machine,
         limits=setting.limits,
         dropped=dropped,
+        way=way,
+        way_blocked=0 if way is None else int((~allowed(machine, setting.part, way, margin=0.0)).sum()),
     )
 
 
@@ -138,6 +163,13 @@ def _certificate(goal: Goal, tables: Views, fine: Views, views: int) -> tuple[fl
     return reached, dual_bound(A, m, goal.w, views, prices=fine.A.max(axis=0), reached=reached)
 
 
+def _require_time(seconds: float, limits: ScanLimits, views: int) -> None:
+    if seconds > limits.time.limit:
+        raise InputError(
+            f"limits: [time] limit_s = {limits.time.limit:g} s is too short for {views} views, taking {seconds:.3g} s"
+        )
+
+
 def _within_time(
     machine: Machine, limits: ScanLimits, goal: Goal, q: Array, fine: Views
 ) -> tuple[Array, tuple[int, float]]:
@@ -147,11 +179,7 @@ def _within_time(
     while kept > 2 and duration(machine, limits.time, q[:kept][order]) > limits.time.limit:
         kept -= max(kept // 20, 1)
         order = visiting_order(machine, q[:kept])
-    if duration(machine, limits.time, q[:kept][order]) > limits.time.limit:
-        raise InputError(
-            f"limits: [time] limit_s = {limits.time.limit:g} s is too short for {kept} views, which take "
-            f"{duration(machine, limits.time, q[:kept][order]):.3g} s"
-        )
+    _require_time(duration(machine, limits.time, q[:kept][order]), limits, kept)
     lost = 0.0
     if kept < len(q):
         w = goal.w
@@ -179,6 +207,7 @@ class _Judge:
 
     def __call__(self, q: Array) -> Judged:
         P, goal = self.machine.matrices(q), self.goal
+        time_of = turn_duration if self.setting.continuous else duration
         views = table(goal, P)
         shared = None
         if self.setting.calibration is not None:
@@ -193,7 +222,7 @@ class _Judge:
             features=found,
             lengths={} if self.setting.features is None else measurand_u(self.setting.features.measurands, found),
             travel=travel(self.machine, q),
-            duration=duration(self.machine, self.setting.limits.time, q),
+            duration=time_of(self.machine, self.setting.limits.time, q),
             tau=views.M,
             seen=(views.A[:, : len(goal.x)] > 0).sum(axis=0),
             out_of_view=int((~allowed(self.machine, goal.part, q, margin=0.0)).sum()),

@@ -5,16 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from tomopose.calibration.result import Calibration
-from tomopose.errors import InputError
+from tomopose.errors import InputError, OutOfReachError
 from tomopose.geometry.scanner import Scanner
+from tomopose.manipulator.hexapod import Hexapod
 from tomopose.measurement.plan import MeasurementPlan
 from tomopose.planning.design import nominal_mount
 from tomopose.planning.part.part import Part
 from tomopose.planning.part.settings import PartSettings
 from tomopose.planning.part.targets import plane_normals, targets_of, tuy_points
-from tomopose.planning.part.worth import Goal
+from tomopose.planning.part.worth import Goal, Views, table
 from tomopose.planning.part_scan.limits_file import ScanLimits
-from tomopose.planning.part_scan.stations import Machine
+from tomopose.planning.part_scan.stations import Machine, stations
+from tomopose.units import Array
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -27,6 +29,8 @@ class Setting:
     features:    a measurement plan; without it the whole surface counts, by area.
     limits:      travel, times, obstacles; without them +-10 mm, +-5 deg and a table that turns freely.
     calibration: the mount, pivot and shared uncertainty; without it the paper's mount, R_z(180 deg).
+    manipulator: the hexapod whose legs have to stay within their stroke.
+    continuous:  whether the views lie on one smooth turn.
     """
 
     scanner: Scanner
@@ -36,6 +40,8 @@ class Setting:
     features: MeasurementPlan | None = None
     limits: ScanLimits = field(default_factory=ScanLimits)
     calibration: Calibration | None = None
+    manipulator: Hexapod | None = None
+    continuous: bool = False
 
     def __post_init__(self) -> None:
         if self.views < 1:
@@ -50,7 +56,24 @@ class Setting:
             limits=self.limits.travel,
             obstacles=self.limits.obstacles,
             pivot=None if cal is None else cal.pivot,
+            manipulator=self.manipulator,
         )
+
+    def candidates(self, goal: Goal) -> tuple[Array, Views]:
+        """(q (n, 7), their tables): all views that limits, panel, obstacles and transmission allow.
+
+        OutOfReachError where none is left.
+        """
+        q = stations(self.machine, self.part, self.settings)
+        tables = table(goal, self.machine.matrices(q))
+        kept = self.settings.least_view_transmission <= tables.M
+        if not kept.any():
+            raise OutOfReachError(
+                f"no view of {self.part.name} transmits {self.settings.least_view_transmission:g} on average: the "
+                f"best of {len(q)} candidates has {tables.M.max():.2g}; a higher voltage, or a lower limit, is needed",
+                limits=self.limits.travel,
+            )
+        return q[kept], tables.take(kept)
 
     def goal(self, *, judged: bool = False) -> Goal:
         """Points to plan with, or, judged, points of another pattern."""

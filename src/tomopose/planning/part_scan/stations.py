@@ -11,10 +11,11 @@ from tomopose.geometry.projection import eq5_matrices, object_motion, project
 from tomopose.geometry.rotations import rotation_from_convention
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.manipulator.hexapod import Hexapod
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.planning.part.keep_out import Obstacle, hits
 from tomopose.planning.part.part import Part
 from tomopose.planning.part.settings import PartSettings
-from tomopose.planning.part_scan.keep_out import Obstacle, hits
 from tomopose.trajectory.feasibility import AXES, TravelLimits, in_view
 from tomopose.units import Array
 
@@ -30,7 +31,7 @@ class Machine:
     """What moves the part, and within what.
 
     limits: x, y, z mm, angles of R_x R_y R_z and table, rad; a table interval of 360 deg or more turns freely.
-    pivot:  of the manipulator, as `PoseSequence` has it.
+    pivot:  of the manipulator, as `PoseSequence` has it;  manipulator: whose legs have to stay within their stroke.
     """
 
     scanner: Scanner
@@ -38,6 +39,7 @@ class Machine:
     limits: TravelLimits
     obstacles: tuple[Obstacle, ...] = ()
     pivot: Array | None = None
+    manipulator: Hexapod | None = None
 
     @property
     def turns_freely(self) -> bool:
@@ -70,12 +72,15 @@ class Machine:
 
 
 def allowed(machine: Machine, part: Part, q: Array, *, margin: float) -> np.ndarray:
-    """(n,) bool: the whole part on the panel, between source and panel, and clear of the obstacles."""
+    """(n,) bool: the whole part on the panel, between source and panel, clear of the obstacles, and within stroke."""
     P = machine.matrices(q)
     depth = np.einsum("nj,mj->nm", P[:, 2, :3], part.hull) + P[:, 2, 3:]
     good = (depth > 0).all(axis=1) & (depth < machine.scanner.d_SD).all(axis=1)
     seen = in_view(P, part.hull, n_u=machine.scanner.n_u, n_v=machine.scanner.n_v, margin=margin).all(axis=1)
     good &= seen
+    if machine.manipulator is not None:
+        T_MH = machine.poses(q).T_MH
+        good &= machine.manipulator.reaches(T_MH.R, T_MH.t)
     for obstacle in machine.obstacles:
         index = np.flatnonzero(good)
         good[index] &= ~hits(obstacle, part.hull, part.hull_planes, _motions(machine, q[index]))
@@ -144,6 +149,14 @@ def _what_blocks(machine: Machine, part: Part, q: Array, settings: PartSettings)
             f"panel has {free[0]:.0f} x {free[1]:.0f} px inside the margin; move it nearer to the panel, or turn it"
         )
     seen = in_view(P, part.hull, n_u=scanner.n_u, n_v=scanner.n_v, margin=settings.margin).all(axis=1)
+    if machine.manipulator is not None:
+        T_MH = machine.poses(q).T_MH
+        reached = machine.manipulator.reaches(T_MH.R, T_MH.t)
+        if not (seen & reached).any():
+            return (
+                f"the hexapod's legs leave their stroke in every pose that keeps {part.name} in view "
+                f"({int(reached.sum())} of {len(q)} poses are within it)"
+            )
     if seen.any():
         names = ", ".join(o.name for o in machine.obstacles)
         return f"every pose that keeps {part.name} in view hits what must stay clear ({names})"

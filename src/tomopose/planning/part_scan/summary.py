@@ -50,6 +50,7 @@ def _constants(s: PartSettings) -> Content:
     return {
         "mu_per_mm": s.mu,
         "least_transmission": s.least_transmission,
+        "least_view_transmission": s.least_view_transmission,
         "tangent_deg": math.degrees(s.tangent),
         "tuy_deg": math.degrees(s.tuy_width),
         "weights_C_T_M": list(WEIGHTS),
@@ -84,6 +85,8 @@ def plan_document(plan: PartScanPlan) -> Content:
         "paths": {name: _judged(j) for name, j in plan.paths.items()},
         "unseen": [{"name": name, "why": why} for name, why in plan.unseen.items()],
         "dropped": {"views": plan.dropped[0], "J": plan.dropped[1]},
+        "continuous": plan.way is not None,
+        "way": None if plan.way is None else {"places": len(plan.way), "places_not_allowed": plan.way_blocked},
         "transmission_by_view": plan.chosen.tau.tolist(),
         "limits": {name: bounds[:, k].tolist() for k, name in enumerate(names)},
         "assumed_limits": list(plan.limits.assumed),
@@ -104,6 +107,11 @@ def plan_lines(plan: PartScanPlan) -> list[str]:
         out = f"; {j.out_of_view} views out of view" if j.out_of_view else ""
         lines.append(f"  {name:<9}{w.J:7.3f}{w.C:7.3f}{w.T:7.3f}{w.M:7.3f}{j.travel:8.0f}{out}")
     lines += [f"  {name}: {why}" for name, why in plan.unseen.items()]
+    if plan.way is not None and plan.way_blocked:
+        lines.append(
+            f"  {plan.way_blocked} of {len(plan.way)} places between the views are not allowed (view, stroke or "
+            "keep-out); stop there and go around, or ask for more views"
+        )
     if plan.dropped[0]:
         lines.append(
             f"  {plan.dropped[0]} views left out to keep the time limit; they would have added {plan.dropped[1]:.4f}"

@@ -33,6 +33,12 @@ def duration(machine: Machine, time: MoveTime, q: Array) -> float:
     return float((d / speeds).max(axis=1).sum() + len(d) * time.settle + len(q) * time.image)
 
 
+def turn_duration(machine: Machine, time: MoveTime, q: Array) -> float:
+    """s: without stops; each step takes as long as its slowest axis or its image, whichever is longer."""
+    speeds = np.array([time.speed] * 3 + [time.speed_deg] * 4)
+    return float(np.maximum((steps(machine, q[:-1], q[1:]) / speeds).max(axis=1), time.image).sum() + time.image)
+
+
 def visiting_order(machine: Machine, q: Array) -> np.ndarray:
     """(n,) rows of q (n, 7) in a short order that begins nearest to the machine's present place: zero, or its limits.
 

@@ -110,6 +110,29 @@ def source_path(matrices: ProjectionMatrices) -> SourcePath | None:
     )
 
 
+def height_obstacle(path: SourcePath) -> str:
+    """Why FDK cannot follow the source's height, in words; empty where it can."""
+    if path.smooth:
+        return ""
+    return (
+        "it follows the source's path from view to view about the axis, and here the height of the source jumps "
+        "between neighbours by angle (several rings, or scattered views)"
+    )
+
+
+def holes_obstacle(path: SourcePath) -> str:
+    """Why stretches without views forbid FDK, in words; empty where they need not."""
+    covered = math.degrees(path.coverage)
+    if len(path.holes) > 1:
+        return f"the turn has {len(path.holes)} stretches without views, {360 - covered:.0f} degrees together"
+    if len(path.holes) == 1 and not path.circular:
+        return (
+            f"the source covers {covered:.0f} of 360 degrees and leaves the plane of its path: weights for a short "
+            "scan are defined on a circle"
+        )
+    return ""
+
+
 def tangents(arm: Array, axis: Array, slope: Array) -> Array:
     """(n, 3): d arm / d angle about the axis, where d elevation / d angle is `slope` (n,)."""
     around = np.cross(axis, arm)
