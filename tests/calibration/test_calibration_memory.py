@@ -42,3 +42,28 @@ def test_four_times_the_poses_take_four_times_the_memory(scanner, T_HT):
     assert many < 5 * few
     # Measured: 11.5 kB a centre, most of it the columns of the tests of the scanner's values.
     assert many < 13_000 * 400 * BALLS
+
+
+def test_rows_looked_at_in_parts_give_the_same_explanations(scanner, T_HT, monkeypatch):
+    from tomopose.calibration.checks.score_tests import ranking, score
+
+    rng = np.random.default_rng(3)
+    poses = PoseSequence.from_table(
+        rng.uniform(-9, 9, (90, 3)), rng.uniform(-6, 6, (90, 3)), alpha=rng.choice([0.0, np.pi / 2], 90)
+    )
+    x_D = project_ball(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=[8.0, -6.0, 17.0], alpha=poses.alpha)
+    x_D = x_D + rng.normal(0, 0.01, x_D.shape) + (np.arange(90) >= 50)[:, None] * [0.2, -0.1]
+    observations = BallObservations.from_sigma(x_D, 0.01, pose_id=poses.pose_id)
+    whole = calibrate(scanner, poses, observations)
+    for module in (ranking, score):
+        monkeypatch.setattr(module, "PART", 16)
+    parts = calibrate(scanner, poses, observations)
+    assert [(e.name, e.at, e.predicts) for e in parts.explanations] == [
+        (e.name, e.at, e.predicts) for e in whole.explanations
+    ]
+    assert whole.explanations
+    for a, b in zip(parts.explanations, whole.explanations, strict=True):
+        assert a.evidence == pytest.approx(b.evidence, rel=1e-6)
+        np.testing.assert_allclose(a.size, b.size, rtol=1e-5, atol=1e-8)
+    for a, b in zip(parts.stability.effects, whole.stability.effects, strict=True):
+        assert (a.at, a.share) == (b.at, pytest.approx(b.share, rel=1e-6))

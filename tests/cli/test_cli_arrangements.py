@@ -119,6 +119,21 @@ def test_moving_scanner_from_files_to_matrices(gantry, capsys):
     assert (folder / "auto" / "report.html").stat().st_size > 1000
 
 
+@pytest.mark.parametrize(("scatter_mm", "code"), [(0.0, 0), (2.0, 3)])
+def test_a_d_sd_that_varies_from_view_to_view_is_not_trusted(tmp_path, scanner, rng, scatter_mm, code):
+    """An arm that sags moves the panel along the beam: the centres move along the line from the piercing point."""
+    poses = tp.PoseSequence.from_table(rng.uniform(-12, 12, (150, 3)), rng.uniform(-6, 6, (150, 3)))
+    mount = tp.RigidTransform.from_angles([0.02, -0.01, 0.03], [3.0, 1.0, -2.0], source=tp.Frame.H, target=tp.Frame.T)
+    x = project_ball(scanner, T_HT=mount, T_MH=tp.inverse_poses(poses).T_MH, t=[14.0, -16.0, 15.0])
+    pierced = np.array([scanner.u_0, scanner.v_0])
+    scale = 1.0 + scatter_mm / scanner.d_SD * rng.standard_normal(len(poses))
+    x = pierced + (x - pierced) * scale[:, None] + SIGMA * rng.standard_normal(x.shape)
+    tp.write_scanner(tmp_path / "scanner.json", scanner.exact())
+    tp.write_poses(tmp_path / "poses.csv", poses)
+    tp.write_observations(tmp_path / "o.csv", tp.BallObservations.from_sigma(x, SIGMA, pose_id=poses.pose_id))
+    assert calibrate(tmp_path, "cal", "--arrangement", "moving-scanner") == code
+
+
 def test_commands_move_the_scanner_where_it_was_wanted(gantry):
     """The machine that errs, commanded so, images as a perfect one with the mount that was found."""
     folder, machine, p, scan, _, _, mount = gantry
