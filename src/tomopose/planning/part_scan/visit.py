@@ -26,17 +26,21 @@ def travel(machine: Machine, q: Array) -> float:
     return float(steps(machine, q[:-1], q[1:]).sum())
 
 
+def _moves(machine: Machine, time: MoveTime, q: Array) -> Array:
+    """(n - 1,) s that the slowest axis takes from each place of q (n, 7) to the next."""
+    moves: Array = (steps(machine, q[:-1], q[1:]) / np.array([time.speed] * 3 + [time.speed_deg] * 4)).max(axis=1)
+    return moves
+
+
 def duration(machine: Machine, time: MoveTime, q: Array) -> float:
     """s: of every step the slowest axis and settling, and the images."""
-    d = steps(machine, q[:-1], q[1:])
-    speeds = np.array([time.speed] * 3 + [time.speed_deg] * 4)
-    return float((d / speeds).max(axis=1).sum() + len(d) * time.settle + len(q) * time.image)
+    moves = _moves(machine, time, q)
+    return float(moves.sum() + len(moves) * time.settle + len(q) * time.image)
 
 
 def turn_duration(machine: Machine, time: MoveTime, q: Array) -> float:
     """s: without stops; each step takes as long as its slowest axis or its image, whichever is longer."""
-    speeds = np.array([time.speed] * 3 + [time.speed_deg] * 4)
-    return float(np.maximum((steps(machine, q[:-1], q[1:]) / speeds).max(axis=1), time.image).sum() + time.image)
+    return float(np.maximum(_moves(machine, time, q), time.image).sum() + time.image)
 
 
 def visiting_order(machine: Machine, q: Array) -> np.ndarray:
