@@ -24,26 +24,26 @@ def steepest_axis(d_x: float, d_y: float, d_z: float) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _across(axis: int) -> tuple[int, int]:
+def across(axis: int) -> tuple[int, int]:
     """The two axes across `axis`, the smaller first."""
     return (1 if axis == 0 else 0), (1 if axis == 2 else 2)
 
 
 @njit(cache=True, nogil=True)
-def _direction(d: np.ndarray, M_inv: np.ndarray, u: int, v: int) -> None:
+def ray_direction(d: np.ndarray, M_inv: np.ndarray, u: int, v: int) -> None:
     """The direction of pixel (u, v)'s ray, in voxel indices, into d (3,)."""
     for i in range(3):
         d[i] = M_inv[i, 0] * u + M_inv[i, 1] * v + M_inv[i, 2]
 
 
 @njit(cache=True, nogil=True)
-def _length(d: np.ndarray, spacing: np.ndarray) -> float:
+def mm_length(d: np.ndarray, spacing: np.ndarray) -> float:
     """Length of a direction in voxel indices, mm."""
     return math.sqrt((d[0] * spacing[0]) ** 2 + (d[1] * spacing[1]) ** 2 + (d[2] * spacing[2]) ** 2)
 
 
 @njit(cache=True, nogil=True)
-def _strides(shape: tuple[int, int, int]) -> tuple[int, int, int]:
+def volume_strides(shape: tuple[int, int, int]) -> tuple[int, int, int]:
     """Steps along x, y, z of a flat volume with margins; their sum is the place of voxel (0, 0, 0)."""
     s_y = shape[2] + MARGIN
     return (shape[1] + MARGIN) * s_y, s_y, 1
@@ -57,11 +57,11 @@ def _planes(low: float, high: float, a: float, slope: float, n: int) -> tuple[fl
 
 
 @njit(cache=True, nogil=True)
-def _ray(
+def ray_planes(
     source: np.ndarray, d: np.ndarray, axis: int, shape: tuple[int, int, int]
 ) -> tuple[int, int, float, float, float, float]:
     """k_0, k_1, a, da, b, db of a ray: positions a + k da, b + k db in the planes k_0 <= k < k_1 across `axis`."""
-    first, second = _across(axis)
+    first, second = across(axis)
     da, db = d[first] / d[axis], d[second] / d[axis]
     a, b = source[first] - source[axis] * da, source[second] - source[axis] * db
     low, high = _planes(-1.0, float(shape[axis]), a, da, shape[first])
@@ -71,7 +71,7 @@ def _ray(
 
 
 @njit(cache=True, nogil=True)
-def _place(position: float, n: int) -> tuple[int, np.float32]:
+def held_place(position: float, n: int) -> tuple[int, np.float32]:
     """Whole and fractional part of a position held within [-1, n], where the volume's margin is zero."""
     held = min(max(position, -1.0), float(n)) + 1.0  # not negative: int() rounds towards zero
     i = int(held)
@@ -82,33 +82,33 @@ def _place(position: float, n: int) -> tuple[int, np.float32]:
 def _line_integral(volume: np.ndarray, rays: Rays, d: np.ndarray) -> float:
     """Joseph's sum along the ray of direction d, any axis, mm times the volume's unit."""
     axis = steepest_axis(d[0], d[1], d[2])
-    first, second = _across(axis)
-    k_0, k_1, a, da, b, db = _ray(rays.source, d, axis, rays.shape)
-    strides = _strides(rays.shape)
+    first, second = across(axis)
+    k_0, k_1, a, da, b, db = ray_planes(rays.source, d, axis, rays.shape)
+    strides = volume_strides(rays.shape)
     start = strides[0] + strides[1] + strides[2]
     s_a, s_b = strides[first], strides[second]
     total = F32(0.0)
     for k in range(k_0, k_1):
-        i, f_a = _place(a + k * da, rays.shape[first])
-        j, f_b = _place(b + k * db, rays.shape[second])
+        i, f_a = held_place(a + k * da, rays.shape[first])
+        j, f_b = held_place(b + k * db, rays.shape[second])
         p = start + k * strides[axis] + i * s_a + j * s_b
         low = volume[p] + f_b * (volume[p + s_b] - volume[p])
         high = volume[p + s_a] + f_b * (volume[p + s_a + s_b] - volume[p + s_a])
         total += low + f_a * (high - low)
-    integral: float = total * (_length(d, rays.spacing) / abs(d[axis]))
+    integral: float = total * (mm_length(d, rays.spacing) / abs(d[axis]))
     return integral
 
 
 @njit(cache=True, nogil=True)
-def _common_axis(rays: Rays, u: int, v: int, count: int, d: np.ndarray) -> int:
+def common_axis(rays: Rays, u: int, v: int, count: int, d: np.ndarray) -> int:
     """The steepest axis, x or y, of the `count` rays from pixel (u, v) upwards along v; -1 where they do not share one.
 
     Directions change linearly with v: what is steepest, with one sign, at both ends is so in between.
     """
-    _direction(d, rays.M_inv, u, v)
+    ray_direction(d, rays.M_inv, u, v)
     axis = steepest_axis(d[0], d[1], d[2])
     forwards = d[axis] > 0.0
-    _direction(d, rays.M_inv, u, v + count - 1)
+    ray_direction(d, rays.M_inv, u, v + count - 1)
     same = axis == steepest_axis(d[0], d[1], d[2]) and (d[axis] > 0.0) == forwards
     return axis if same and axis < 2 else -1
 
@@ -122,9 +122,9 @@ def _block_of_rays(
     centre = 0.5 * (rays.shape[axis] - 1)
     k_0, k_1 = rays.shape[axis], 0
     for lane in range(count):
-        _direction(d, rays.M_inv, u, v + lane)
-        work.steps[lane] = _length(d, rays.spacing) / abs(d[axis])
-        low, high, a, da, b, db = _ray(rays.source, d, axis, rays.shape)
+        ray_direction(d, rays.M_inv, u, v + lane)
+        work.steps[lane] = mm_length(d, rays.spacing) / abs(d[axis])
+        low, high, a, da, b, db = ray_planes(rays.source, d, axis, rays.shape)
         if high > low:
             k_0, k_1 = min(k_0, low), max(k_1, high)
         table[lane], table[W + lane] = a + centre * da, da
@@ -134,7 +134,7 @@ def _block_of_rays(
             table[i * W + lane] = table[i * W + count - 1]
     work.sums[:] = 0.0
     if k_1 > k_0:
-        strides = _strides(rays.shape)
+        strides = volume_strides(rays.shape)
         other = 1 - axis
         start = strides[0] + strides[1] + strides[2]
         ends = (F32(centre), F32(rays.shape[other]), F32(rays.shape[2]))
@@ -155,27 +155,27 @@ def forward_columns(volume: np.ndarray, rays: Rays, image: np.ndarray, vector: b
     for u in range(u_0, u_1):
         for v in range(0, n_v, W):
             count = min(W, n_v - v)
-            axis = _common_axis(rays, u, v, count, d) if vector else -1
+            axis = common_axis(rays, u, v, count, d) if vector else -1
             if axis >= 0:
                 _block_of_rays(volume, rays, axis, u, v, count, image, d, work)
                 continue
             for lane in range(count):
-                _direction(d, rays.M_inv, u, v + lane)
+                ray_direction(d, rays.M_inv, u, v + lane)
                 image[u, v + lane] = _line_integral(volume, rays, d)
 
 
 @njit(cache=True, nogil=True)
 def _scatter(volume: np.ndarray, rays: Rays, d: np.ndarray, value: float, axis: int, k_start: int, k_stop: int) -> None:
     """The transpose of `_line_integral` for planes k_start <= k < k_stop of a ray steepest along `axis`."""
-    first, second = _across(axis)
-    low, high, a, da, b, db = _ray(rays.source, d, axis, rays.shape)
-    strides = _strides(rays.shape)
+    first, second = across(axis)
+    low, high, a, da, b, db = ray_planes(rays.source, d, axis, rays.shape)
+    strides = volume_strides(rays.shape)
     start = strides[0] + strides[1] + strides[2]
     s_a, s_b = strides[first], strides[second]
-    weight = F32(value * _length(d, rays.spacing) / abs(d[axis]))
+    weight = F32(value * mm_length(d, rays.spacing) / abs(d[axis]))
     for k in range(max(low, k_start), min(high, k_stop)):
-        i, f_a = _place(a + k * da, rays.shape[first])
-        j, f_b = _place(b + k * db, rays.shape[second])
+        i, f_a = held_place(a + k * da, rays.shape[first])
+        j, f_b = held_place(b + k * db, rays.shape[second])
         p = start + k * strides[axis] + i * s_a + j * s_b
         volume[p] += weight * (F32(1.0) - f_a) * (F32(1.0) - f_b)
         volume[p + s_b] += weight * (F32(1.0) - f_a) * f_b
@@ -196,7 +196,7 @@ def scatter_planes(volume: np.ndarray, rays: Rays, image: np.ndarray, axis: int,
             value = image[u, v]
             if value == 0.0:
                 continue
-            _direction(d, rays.M_inv, u, v)
+            ray_direction(d, rays.M_inv, u, v)
             if steepest_axis(d[0], d[1], d[2]) == axis:
                 _scatter(volume, rays, d, value, axis, k_start, k_stop)
 
@@ -207,9 +207,9 @@ def ray_lengths(rays: Rays, image: np.ndarray, u_0: int, u_1: int) -> None:
     d = np.zeros(3)
     for u in range(u_0, u_1):
         for v in range(image.shape[1]):
-            _direction(d, rays.M_inv, u, v)
+            ray_direction(d, rays.M_inv, u, v)
             low, high = 0.0, np.inf
             for i in range(3):
                 low, high = clip_range(low, high, rays.source[i] + 0.5, d[i])
                 low, high = clip_range(low, high, rays.shape[i] - 0.5 - rays.source[i], -d[i])
-            image[u, v] = max(high - low, 0.0) * _length(d, rays.spacing)
+            image[u, v] = max(high - low, 0.0) * mm_length(d, rays.spacing)

@@ -176,14 +176,24 @@ def _bilinear(
     builder: ir.IRBuilder, data: ir.Value, count: ir.Value, base: ir.Value, row: ir.Value, a: ir.Value, b: ir.Value
 ) -> ir.Value:
     """data at the fractional position (a, b): a counts rows of length `row` (int32), b is the contiguous axis."""
+    return _bilinear_with_slopes(builder, data, count, base, row, a, b)[0]
+
+
+def _bilinear_with_slopes(
+    builder: ir.IRBuilder, data: ir.Value, count: ir.Value, base: ir.Value, row: ir.Value, a: ir.Value, b: ir.Value
+) -> tuple[ir.Value, ir.Value, ir.Value]:
+    """data at (a, b) as `_bilinear` gives it, and its slopes along a and b; what nobody uses is not compiled."""
     floor_a, floor_b = _call(builder, "floor", a), _call(builder, "floor", b)
     f_a, f_b = builder.fsub(a, floor_a), builder.fsub(b, floor_b)
     p00, p01, p10, p11 = _neighbours(
         builder, data, count, base, row, builder.fptosi(floor_a, VI), builder.fptosi(floor_b, VI)
     )
-    low = _call(builder, "fma", f_b, builder.fsub(p01, p00), p00)
-    high = _call(builder, "fma", f_b, builder.fsub(p11, p10), p10)
-    return _call(builder, "fma", f_a, builder.fsub(high, low), low)
+    rise_low, rise_high = builder.fsub(p01, p00), builder.fsub(p11, p10)
+    low = _call(builder, "fma", f_b, rise_low, p00)
+    high = _call(builder, "fma", f_b, rise_high, p10)
+    slope_a = builder.fsub(high, low)
+    slope_b = _call(builder, "fma", f_a, builder.fsub(rise_high, rise_low), rise_low)
+    return _call(builder, "fma", f_a, slope_a, low), slope_a, slope_b
 
 
 def _weighted_pixels(
@@ -311,6 +321,60 @@ def forward_block(
             value = _bilinear(builder, voxels, count, start, row, at_a, at_b)
             builder.store(builder.fadd(builder.load(total, typ=VF), value), total)
         builder.store(builder.load(total, typ=VF), _at(builder, target, ir.Constant(I64, 0), VF), align=4)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@intrinsic
+def derivative_block(
+    typingctx: Context,
+    volume: types.Type,
+    base: types.Type,
+    plane: types.Type,
+    row: types.Type,
+    rays: types.Type,
+    planes: types.Type,
+    ends: types.Type,
+    sums: types.Type,
+) -> Intrinsic:
+    """As `forward_block`, with the slopes in the same walk: five sums for each of W rays.
+
+    sums (5 W,): of the volume f, df/da, (k - centre) df/da, df/db and (k - centre) df/db, over the planes k_0 <= k < k_1.
+    """
+    signature = types.void(
+        volume,
+        types.int64,
+        types.int64,
+        types.int32,
+        rays,
+        tuple_of(types.int64, 2),
+        tuple_of(types.float32, 3),
+        sums,
+    )
+
+    def generate(context: Context, builder: ir.IRBuilder, signature: Signature, arguments: Arguments) -> ir.Value:
+        volume, base, plane, row, rays, planes, ends, sums = arguments
+        voxels = _data(context, builder, signature.args[0], volume)
+        count = _count(context, builder, signature.args[0], volume)
+        table = _data(context, builder, signature.args[4], rays)
+        target = _data(context, builder, signature.args[7], sums)
+        k_0, k_1 = cgutils.unpack_tuple(builder, planes, 2)
+        centre, a_end, b_end = cgutils.unpack_tuple(builder, ends, 3)
+        a, da, b, db = (_load(builder, table, ir.Constant(I64, i * W)) for i in range(4))
+        a_end, b_end = _splat(builder, a_end), _splat(builder, b_end)
+        totals = [cgutils.alloca_once_value(builder, ir.Constant(VF, [0.0] * W)) for _ in range(5)]
+        with cgutils.for_range_slice(builder, k_0, k_1, ir.Constant(I64, 1), I64) as (k, _number):
+            step = _splat(builder, builder.fsub(builder.sitofp(k, F32), centre))
+            at_a = _held(builder, _call(builder, "fma", step, da, a), a_end)
+            at_b = _held(builder, _call(builder, "fma", step, db, b), b_end)
+            start = builder.add(base, builder.mul(k, plane))
+            value, slope_a, slope_b = _bilinear_with_slopes(builder, voxels, count, start, row, at_a, at_b)
+            terms = (value, slope_a, builder.fmul(step, slope_a), slope_b, builder.fmul(step, slope_b))
+            for total, term in zip(totals, terms, strict=True):
+                builder.store(builder.fadd(builder.load(total, typ=VF), term), total)
+        for i, total in enumerate(totals):
+            builder.store(builder.load(total, typ=VF), _at(builder, target, ir.Constant(I64, i * W), VF), align=4)
         return context.get_dummy_value()
 
     return signature, generate

@@ -1,0 +1,1 @@
+"""Refinement: the scan's own images correct the geometry of each view."""

@@ -1,0 +1,100 @@
+r"""One Gauss-Newton step for the volume and all poses together.
+
+Unknown are the volume x >= 0 and, for each view, d numbers q: six of a motion and the level of the image.  With the
+residual r, weights W, the projector A and the views' derivatives J the step minimises
+
+    |W^(1/2) (r - A dx - J dq)|^2  +  (q + dq)' C^-1 (q + dq)  +  lambda |x + dx|^2.
+
+dq is eliminated exactly, with the whole precision C^-1, correlated over views:  M = J'WJ + C^-1 (Cholesky); the volume
+is found by conjugate gradients on the Schur complement  A'WA - A'WJ M^-1 J'WA + lambda, over the voxels that are free to
+move (`free`: not held at zero by the bound).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from tomopose.engines.cpu import CpuEngine
+from tomopose.units import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Linear:
+    """The linearised problem.
+
+    engine:   projector of the current matrices.  free: bool, as the engine's state; voxels that may move.
+    J:        (n, d, N) derivatives of each view's N pixels.  w: (n, N) weights.
+    factor:   Cholesky factor of M (n d, n d).  ridge: lambda.
+    """
+
+    engine: CpuEngine
+    free: np.ndarray
+    J: Array
+    w: Array
+    factor: tuple[Array, bool]
+    ridge: float
+
+    @classmethod
+    def of(cls, engine: CpuEngine, free: np.ndarray, J: Array, w: Array, precision: Array, ridge: float) -> Linear:
+        """Factorise M = J'WJ + precision (n d, n d)."""
+        n, d = J.shape[:2]
+        M = precision.copy()
+        for j, block in enumerate(normal_blocks(J, w)):
+            M[j * d : j * d + d, j * d : j * d + d] += block
+        return cls(engine=engine, free=free, J=J, w=w, factor=scipy.linalg.cho_factor(M), ridge=ridge)
+
+    def project(self, x: np.ndarray) -> Array:
+        """A x, (n, N)."""
+        n = len(self.w)
+        lines = self.engine.forward(x, range(n)).transpose(0, 2, 1)
+        return lines.reshape(n, -1)
+
+    def back(self, y: Array) -> np.ndarray:
+        """A' y over the free voxels."""
+        n, m = len(self.w), self.engine.matrices
+        images = y.reshape(n, m.n_u, m.n_v).transpose(0, 2, 1)
+        return np.where(self.free, self.engine.transpose(images, range(n)), np.float32(0))
+
+    def poses(self, y: Array, pull: Array | float = 0.0) -> Array:
+        """M^-1 (J'W y - pull), (n, d)."""
+        right = np.einsum("ndp,np->nd", self.J, self.w * y).ravel() - pull
+        return np.asarray(scipy.linalg.cho_solve(self.factor, right)).reshape(len(self.w), -1)
+
+    def moved(self, q: Array) -> Array:
+        """J q, (n, N), float32."""
+        return np.asarray(np.einsum("ndp,nd->np", self.J, q.astype(np.float32)))
+
+    def solve(self, r: Array, pull: Array, x: np.ndarray, *, turns: int, tolerance: float = 1e-3) -> tuple[np.ndarray, Array]:
+        """(dx, dq) for the residual r (n, N); pull: C^-1 q, flat; x: the volume, for the ridge."""
+
+        def reduced(y: Array) -> Array:
+            """W (1 - J M^-1 J'W) y."""
+            return self.w * (y - self.moved(self.poses(y)))
+
+        ridge = np.float32(self.ridge)
+        start = self.w * (r - self.moved(self.poses(r, pull)))
+        residual = self.back(start) - ridge * np.where(self.free, x, 0)
+        dx, direction = np.zeros_like(residual), residual.copy()
+        size = first = float(np.vdot(residual, residual))
+        for _ in range(turns):
+            if size <= tolerance**2 * first or size == 0:
+                break
+            response = self.back(reduced(self.project(direction))) + ridge * direction
+            curvature = float(np.vdot(direction, response))
+            if not curvature > 0:
+                break
+            alpha = np.float32(size / curvature)
+            dx += alpha * direction
+            residual -= alpha * response
+            new = float(np.vdot(residual, residual))
+            direction = residual + np.float32(new / size) * direction
+            size = new
+        return dx, self.poses(r - self.project(dx), pull)
+
+
+def normal_blocks(J: Array, w: Array) -> Array:
+    """J'WJ of each view, (n, d, d), float64."""
+    return np.stack([(Jj * wj) @ Jj.T for Jj, wj in zip(J, w, strict=True)]).astype(np.float64)
