@@ -51,8 +51,8 @@ def step_cylinder(mu: float = 0.04) -> list[Solid]:
     steps = [(8.0, -6.0), (6.0, -2.0), (4.5, 2.0), (3.0, 6.0)]
     out = [Solid(kind="cylinder", centre=(0, 0, z), half=(r, r, 2.0), mu=mu) for r, z in steps]
     turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    bores = ((3.5, 0.0, -5.0, 1.0), (-3.0, 2.5, -5.5, 0.7), (1.0, -1.2, 1.5, 0.6))
-    out += [Solid(kind="cylinder", centre=(x, y, z), half=(r, r, 2.0 if z < 0 else 1.2), mu=-mu) for x, y, z, r in bores]
+    bores = ((4.6, 0.5, -6.0, 2.2), (-3.2, 3.4, -6.0, 1.5), (2.2, -2.4, 2.0, 1.0))
+    out += [Solid(kind="cylinder", centre=(x, y, z), half=(r, r, 1.9), mu=-mu) for x, y, z, r in bores]
     out.append(Solid(kind="cylinder", centre=(0, 0, 2.0), half=(0.8, 0.8, 4.4), mu=-mu, turn=turn))
     return out
 
@@ -155,7 +155,6 @@ def errors(kind: str, n: int, seed: int, panel: Panel) -> np.ndarray:
     if kind == "hexapod":
         a = 2 * np.pi * np.arange(n) / n
         for k in (1, 2, 3, 7, 14):
-            xi += (rng.normal(size=6) * np.cos(k * a)[:, None] + rng.normal(size=6) * np.sin(k * a)[:, None]) * [px * 0.3] * 3 * 1 if False else 0
             size = np.array([0.35 * px] * 3 + [np.radians(0.12)] * 3)
             xi += size * (rng.normal(size=6) * np.cos(k * a)[:, None] + rng.normal(size=6) * np.sin(k * a)[:, None])
     if kind == "jump":

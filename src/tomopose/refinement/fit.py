@@ -1,0 +1,182 @@
+"""The joint fit on one level: Gauss-Newton steps for volume and poses until neither lowers the joint cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tomopose.engines.cpu import CpuEngine
+from tomopose.geometry.projection import ProjectionMatrices
+from tomopose.refinement.derivatives import integrals_with_derivatives
+from tomopose.refinement.joint import Linear, normal_blocks
+from tomopose.refinement.measured import Measured
+from tomopose.refinement.motions import composed, gauge, transforms, without_gauge
+from tomopose.units import Array
+
+LEVEL_SIGMA = 0.01
+"""Prior standard deviation of an image's level (ln of the open beam): a tube drifts by about one per cent in a scan."""
+ROBUST = 4.0
+"""Residuals beyond this many rms are pulled back to it (Huber): scatter and dead pixels, one in 16,000 of noise."""
+SHORTEST_STEP = 0.05
+"""Part of a step at which the line search ends."""
+SETTLED = 3e-4
+"""Relative gain of the joint cost below which a level has reached its minimum."""
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """volume: [z, y, x]; q: (n, 6) motions; offset: (n,) levels of the images; chi: rms residual over noise of the fit;
+    steps: taken so far; settled: whether the last level ended in a minimum; information: (n, 6, 6) J'WJ of each view,
+    the volume held, weights scaled to the residual."""
+
+    volume: np.ndarray
+    q: Array
+    offset: Array
+    chi: float = float("nan")
+    steps: int = 0
+    settled: bool = False
+    information: Array | None = None
+
+
+def matrices_of(data: Measured, q: Array) -> ProjectionMatrices:
+    """The matrices of a level with the motions q."""
+    m = data.matrices
+    P = m.P @ transforms(q, np.asarray(data.grid.centre))
+    return ProjectionMatrices(
+        P=P, n_u=m.n_u, n_v=m.n_v, p_u=m.p_u, p_v=m.p_v, pose_id=m.pose_id, in_front=m.in_front
+    )
+
+
+def lines_of(engine: CpuEngine, state: np.ndarray, n: int) -> Array:
+    """Line integrals (n, N), pixels as [u, v]."""
+    return np.asarray(engine.forward(state, range(n)).transpose(0, 2, 1)).reshape(n, -1)
+
+
+def blank(data: Measured) -> State:
+    """Nothing known: an empty volume and no motion."""
+    n = len(data.p)
+    return State(volume=np.zeros(data.grid.shape, dtype=np.float32), q=np.zeros((n, 6)), offset=np.zeros(n))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """How a level is fitted.
+
+    precision: (6n, 6n) of the motions' prior, or None to hold the poses and fit the volume and the images' levels.
+    steps, turns, threads: as in the settings.
+    """
+
+    precision: Array | None
+    steps: int
+    turns: int
+    threads: int
+
+    def __call__(self, data: Measured, start: State) -> State:
+        """Steps from `start` to a minimum of the joint cost, or until they are used up."""
+        state, n = start, len(data.p)
+        if not state.volume.any():
+            state = self._step(data, state, held=True)[0]
+        settled, taken = False, 0
+        for taken in range(1, self.steps + 1):
+            state, gain = self._step(data, state, held=self.precision is None)
+            settled = gain < SETTLED
+            if settled:
+                break
+        return replace(state, steps=start.steps + taken, settled=settled)
+
+    def _step(self, data: Measured, state: State, *, held: bool) -> tuple[State, float]:
+        """One step with its line search, and the relative gain of the joint cost."""
+        n, grid, threads = len(data.p), data.grid, self.threads
+        first = not state.volume.any()
+        matrices = matrices_of(data, state.q)
+        engine = CpuEngine(matrices, grid, threads=threads)
+        x = engine.put(state.volume)
+        ones = np.ones((n, 1, data.p.shape[1]), dtype=np.float32)
+        if held:
+            lines, J = lines_of(engine, x, n), ones
+        else:
+            images, slopes = integrals_with_derivatives(x, matrices, grid, range(n), threads=threads)
+            lines = images.transpose(0, 2, 1).reshape(n, -1)
+            J = np.concatenate([slopes.transpose(0, 1, 3, 2).reshape(n, 6, -1), ones], axis=1)
+        r = data.p - lines - state.offset[:, None].astype(np.float32)
+        w, chi = robust_weights(r, data.weight, first=first)
+        precision = self._precision(n, held=held)
+        unknown = np.concatenate([state.q, state.offset[:, None]], axis=1)[:, 6 if held else 0 :]
+        free = self._free(engine, x, w * r, first=first)
+        ridge = 0.0 if first else 1.0 / max(float(np.mean(state.volume[state.volume > 0] ** 2)), 1e-30)
+        linear = Linear.of(engine, free, J, w, precision, ridge)
+        pull = precision @ unknown.ravel()
+        dx, dq = linear.solve(r, pull, x, turns=2 * self.turns if first else self.turns)
+
+        def cost(volume: np.ndarray, values: Array, residual: Array) -> float:
+            own = float(values.ravel() @ precision @ values.ravel()) + ridge * float(np.vdot(volume, volume))
+            return float(np.einsum("np,np,np->", w, residual, residual, dtype=np.float64)) + own
+
+        before, part = cost(x, unknown, r), 1.0
+        while part > SHORTEST_STEP:
+            trial, values = self._tried(data, state, engine, x, (part, dx, dq), held=held)
+            at = engine if held else CpuEngine(matrices_of(data, trial.q), grid, threads=threads)
+            residual = data.p - lines_of(at, values, n) - trial.offset[:, None].astype(np.float32)
+            own = np.concatenate([trial.q, trial.offset[:, None]], axis=1)[:, 6 if held else 0 :]
+            after = cost(values, own, residual)
+            if after < before or first:
+                information = None if held else normal_blocks(J[:, :6], w)
+                state = replace(trial, chi=chi, information=information)
+                return state, (before - after) / max(before, 1e-30)
+            part /= 2
+        return replace(state, chi=chi, information=None if held else normal_blocks(J[:, :6], w)), 0.0
+
+    def _tried(
+        self, data: Measured, state: State, engine: CpuEngine, x: np.ndarray, step: tuple[float, np.ndarray, Array], *,
+        held: bool,
+    ) -> tuple[State, np.ndarray]:
+        """The state after part of a step, and its volume as the engine holds it."""
+        part, dx, dq = step
+        values = np.maximum(x + np.float32(part) * dx, 0)
+        offset, q = state.offset + part * dq[:, -1], state.q
+        if not held:
+            assert self.precision is not None
+            centre = np.asarray(data.grid.centre)
+            q = composed(q, part * dq[:, :6], centre)
+            q = without_gauge(q, gauge(data.matrices.P, centre), self.precision)
+        return replace(state, volume=np.array(engine.values(values)), q=q, offset=offset), values
+
+    def _precision(self, n: int, *, held: bool) -> Array:
+        """Of the unknowns of all views, (d n, d n): motions by the prior, levels by their own."""
+        if held:
+            return np.eye(n) / LEVEL_SIGMA**2
+        assert self.precision is not None
+        whole = np.eye(7 * n) / LEVEL_SIGMA**2
+        at = (7 * np.arange(n)[:, None] + np.arange(6)).ravel()
+        whole[np.ix_(at, at)] = self.precision
+        return whole
+
+    def _free(self, engine: CpuEngine, x: np.ndarray, pulled: Array, *, first: bool) -> np.ndarray:
+        """Voxels that may move: inside the grid, and not held at zero by the bound."""
+        free = np.zeros(x.shape, dtype=bool)
+        free[1:-2, 1:-2, 1:-2] = True
+        if first:
+            return free
+        n, m = len(pulled), engine.matrices
+        uphill = engine.transpose(pulled.reshape(n, m.n_u, m.n_v).transpose(0, 2, 1), range(n))
+        return free & ((x > 0) | (uphill > 0))
+
+
+def robust_weights(r: Array, weight: Array, *, first: bool) -> tuple[Array, float]:
+    """Weights (n, N) that fit the residual's own size, and that size over the noise (rms of the pixels in use).
+
+    The residual holds what voxels, scatter and hardening leave besides noise: where it is larger than the noise, the
+    noise's weights would let the images outvote the prior.
+    """
+    used = max(int(np.count_nonzero(weight)), 1)
+    chi = float(np.sqrt(np.einsum("np,np,np->", weight, r, r, dtype=np.float64) / used))
+    if first:
+        return weight, chi
+    size = max(chi, 1.0)
+    z = np.sqrt(weight) * np.abs(r) / np.float32(size)
+    w = weight * np.minimum(1.0, ROBUST / np.maximum(z, 1e-12)).astype(np.float32) / np.float32(size**2)
+    return np.asarray(w, dtype=np.float32), chi

@@ -1,0 +1,146 @@
+"""The images as the fit takes them: line integrals, their noise, and the blocks of pixels that judge it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.ndimage
+import scipy.optimize
+
+from tomopose.geometry.projection import ProjectionMatrices
+from tomopose.reconstruction.line_integrals import LineIntegrals
+from tomopose.units import Array
+from tomopose.volume import VoxelGrid
+
+BLOCK = 8
+"""Side of a held-out block, px: wider than the projector's and the detector's blur, two pixels after binning by 4."""
+LEAST_NOISE = 2e-4
+"""Standard deviation of a pixel, relative to the largest line integral, that no image falls below: what a projector of
+voxels leaves of an exact line integral's rounding."""
+NORMAL_MEDIAN = 1.4826
+"""Standard deviation over median absolute deviation of a normal distribution."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """One level of the images' pyramid.
+
+    p: (n, N) line integrals, pixels as [u, v], float32.  weight: (n, N), 1/variance; 0 for bad and for held-out pixels.
+    judge: (n, N), the same for held-out pixels alone.  matrices, grid: binned to the same level.
+    """
+
+    p: Array
+    weight: Array
+    judge: Array
+    matrices: ProjectionMatrices
+    grid: VoxelGrid
+
+    def of_views(self, index: Array) -> Measured:
+        """Some of the views."""
+        return replace(
+            self,
+            p=self.p[index],
+            weight=self.weight[index],
+            judge=self.judge[index],
+            matrices=self.matrices.select(index),
+        )
+
+
+def measured(scan: LineIntegrals, grid: VoxelGrid, *, held_out: float, seed: int) -> Measured:
+    """The scan at full resolution."""
+    m, n = scan.matrices, len(scan)
+    p = np.empty((n, m.n_u, m.n_v), dtype=np.float32)
+    good = np.empty(p.shape, dtype=bool)
+    for j in range(n):
+        image, bad, _ = scan.view(j)
+        p[j], good[j] = image.T, ~bad.T
+    variance = noise_variance(p, good)
+    weight = np.where(good, 1 / variance, 0).astype(np.float32)
+    apart = held_out_blocks(p.shape, held_out, seed)
+    flat = (n, -1)
+    return Measured(
+        p=p.reshape(flat),
+        weight=np.where(apart, 0, weight).reshape(flat),
+        judge=np.where(apart, weight, 0).reshape(flat),
+        matrices=m,
+        grid=grid,
+    )
+
+
+def held_out_blocks(shape: tuple[int, int, int], share: float, seed: int) -> Array:
+    """bool (n, n_u, n_v): whole blocks of pixels, drawn by chance, about `share` of all."""
+    n, n_u, n_v = shape
+    drawn = np.random.default_rng([seed, 20]).random((n, -(-n_u // BLOCK), -(-n_v // BLOCK))) < share
+    return np.asarray(drawn.repeat(BLOCK, axis=1).repeat(BLOCK, axis=2)[:, :n_u, :n_v])
+
+
+def noise_variance(p: Array, good: Array) -> Array:
+    """Variance of each pixel of (n, n_u, n_v), found from the images: a + b e^p, counts and what does not depend on them.
+
+    The difference of a pixel and the mean of its two neighbours along u has 1.5 times the variance of a pixel; its
+    median absolute deviation, in classes of p, does not see edges.  p is smoothed for the law, so that a pixel's weight
+    does not depend on its own noise.
+    """
+    smooth = scipy.ndimage.uniform_filter(p, size=(1, 3, 3), mode="nearest")
+    keep = good[:, 1:-1] & good[:, :-2] & good[:, 2:]
+    d = (p[:, 1:-1] - 0.5 * (p[:, :-2] + p[:, 2:]))[keep]
+    at = smooth[:, 1:-1][keep]
+    step = max(1, d.size // 2_000_000)
+    d, at = d[::step], at[::step]
+    ends = np.unique(np.quantile(at, np.linspace(0, 1, 13)))
+    floor = (LEAST_NOISE * float(np.quantile(p, 0.999))) ** 2
+    centre, found = [], []
+    for low, high in zip(ends[:-1], ends[1:], strict=True):
+        inside = d[(at >= low) & (at <= high)]
+        if inside.size >= 50:
+            centre.append(0.5 * (low + high))
+            found.append((NORMAL_MEDIAN * np.median(np.abs(inside - np.median(inside)))) ** 2 / 1.5)
+    if not found:
+        return np.full(p.shape, max(floor, float(np.var(d)) / 1.5 if d.size else floor), dtype=np.float32)
+    level = np.maximum(found, floor)
+    columns = np.stack([np.ones(len(centre)), np.exp(centre)], axis=1) / level[:, None]
+    law, _ = scipy.optimize.nnls(columns, np.ones(len(centre)))
+    return np.asarray(np.maximum(law[0] + law[1] * np.exp(smooth), floor), dtype=np.float32)
+
+
+def binned(data: Measured, factor: int) -> Measured:
+    """Images averaged over factor x factor pixels, and a grid of voxels as much larger over the same box."""
+    if factor == 1:
+        return data
+    m, n = data.matrices, len(data.p)
+    small, shape = m.binned(factor), (n, m.n_u // factor, factor, m.n_v // factor, factor)
+
+    def blocks(flat: Array) -> Array:
+        images = flat.reshape(n, m.n_u, m.n_v)[:, : shape[1] * factor, : shape[3] * factor]
+        return np.asarray(images.reshape(shape))
+
+    weight, judge, p = blocks(data.weight), blocks(data.judge), blocks(data.p)
+    total = weight + judge
+    mass = total.sum(axis=(2, 4))
+    mean = (total * p).sum(axis=(2, 4)) / np.where(mass > 0, mass, 1)
+    # a coarse pixel that holds a held-out one judges; the sum of weights is that of a mean
+    apart = (judge > 0).any(axis=(2, 4))
+    cells = tuple(-(-k // factor) for k in data.grid.shape)
+    grid = VoxelGrid(shape=cells, spacing=data.grid.spacing * factor, centre=data.grid.centre)  # type: ignore[arg-type]
+    return Measured(
+        p=mean.astype(np.float32).reshape(n, -1),
+        weight=np.where(apart, 0, mass).astype(np.float32).reshape(n, -1),
+        judge=np.where(apart, mass, 0).astype(np.float32).reshape(n, -1),
+        matrices=small,
+        grid=grid,
+    )
+
+
+def finer(values: np.ndarray, coarse: VoxelGrid, fine: VoxelGrid) -> np.ndarray:
+    """A volume [z, y, x] of a coarse grid on a finer one about the same middle, by trilinear interpolation."""
+    at = np.meshgrid(
+        *(
+            ((np.arange(n) - (n - 1) / 2) * small / large + (m - 1) / 2)
+            for n, m, small, large in zip(
+                fine.shape, coarse.shape, fine.spacing[::-1], coarse.spacing[::-1], strict=True
+            )
+        ),
+        indexing="ij",
+    )
+    return np.asarray(scipy.ndimage.map_coordinates(values, at, order=1, mode="nearest"), dtype=np.float32)

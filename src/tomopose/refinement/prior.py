@@ -1,0 +1,89 @@
+r"""What is known of the views' motions before the images are asked, and how large they are by the evidence.
+
+The covariance of all motions q (6 n) is a sum of parts, each of a known pattern and an unknown size:
+
+    C = sum_i s_i^2 K_i.
+
+Without a calibration the parts are the scatter of the views, translations and turns apart; with one, its own shared
+part (correlated over all views) joins them.  The sizes follow from the data by the fixed point of the evidence (MacKay,
+Neural Computation 4 (1992) 415): s_i^2 is the mean square of the motions in part i plus what the images leave of it
+unknown.  A part whose motions the images find no larger than their own uncertainty shrinks: a right geometry stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tomopose.units import Array
+
+LEAST = 1e-4
+"""Smallest size of a part, relative to where it began: below it a part is as good as absent."""
+LARGEST = 10.0
+"""Largest: what was stated is not exceeded tenfold by evidence alone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prior:
+    """parts: name -> pattern K_i (6n, 6n), at the size that was stated; sizes: s_i, relative to it."""
+
+    names: tuple[str, ...]
+    parts: tuple[Array, ...]
+    sizes: Array
+
+    @property
+    def covariance(self) -> Array:
+        """C (6n, 6n)."""
+        C: Array = sum((s**2 * K for s, K in zip(self.sizes, self.parts, strict=True)), np.zeros_like(self.parts[0]))
+        return C
+
+    @property
+    def precision(self) -> Array:
+        """C^-1 (6n, 6n)."""
+        return np.linalg.inv(self.covariance)
+
+    def of_views(self, index: Array) -> Prior:
+        """The prior of some of the views."""
+        at = (6 * np.asarray(index)[:, None] + np.arange(6)).ravel()
+        return replace(self, parts=tuple(K[np.ix_(at, at)] for K in self.parts))
+
+    def by_evidence(self, q: Array, information: Array, *, turns: int = 20) -> Prior:
+        """The sizes that explain motions q (n, 6) best, given the images' information N (6n, 6n) about them."""
+        prior, flat = self, q.ravel()
+        right = information @ flat + self.precision @ flat  # the estimate is where N q_data = this
+        for _ in range(turns):
+            C = prior.covariance
+            precision = np.linalg.inv(C)
+            posterior = np.linalg.inv(information + precision)
+            mean = posterior @ right
+            pull = precision @ mean
+            spread = precision - precision @ posterior @ precision
+            sizes = []
+            for s, K in zip(prior.sizes, prior.parts, strict=True):
+                explained = float(pull @ K @ pull)
+                expected = float(np.einsum("ij,ji->", spread, K))
+                ratio = explained / expected if expected > 0 else 1.0
+                sizes.append(s * np.clip(ratio, 0.1, 10.0) ** 0.5)
+            new = np.clip(sizes, LEAST, LARGEST)
+            done = np.all(np.abs(np.log(new / prior.sizes)) < 0.01)
+            prior = replace(prior, sizes=new)
+            if done:
+                break
+        return prior
+
+
+def scatter(sigma_mm: Array, sigma_rad: Array) -> Prior:
+    """Independent views: standard uncertainties (n,) of each coordinate's translation, mm, and turn, rad."""
+    n = len(sigma_mm)
+    parts = []
+    for column, sigma in ((slice(0, 3), sigma_mm), (slice(3, 6), sigma_rad)):
+        variance = np.zeros((n, 6))
+        variance[:, column] = np.asarray(sigma)[:, None] ** 2
+        parts.append(np.diag(variance.ravel()))
+    return Prior(names=("shift from view to view", "turn from view to view"), parts=tuple(parts), sizes=np.ones(2))
+
+
+def with_part(prior: Prior, name: str, K: Array) -> Prior:
+    """The prior with one part more."""
+    return Prior(names=(*prior.names, name), parts=(*prior.parts, K), sizes=np.append(prior.sizes, 1.0))

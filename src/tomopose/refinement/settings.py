@@ -1,0 +1,61 @@
+"""What governs a refinement: each threshold beside its reason."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from tomopose.errors import InputError
+
+DEFAULT_SIGMA_PX = 1.0
+"""Standard uncertainty of a view, px, where neither the calibration nor the matrices state one: a robot's scatter of
+20 to 100 um at a magnification of 5 and pixels of 0.2 mm.  The evidence changes it."""
+
+SIGNIFICANCE = 3.0
+"""Standard errors by which the blocks kept out of the fit must gain before a correction is taken."""
+
+MISFIT = 2.0
+"""Residual over noise beyond which the model does not hold, where the residual is also larger than `MISFIT_SHARE`.
+On the scans of benchmarks/refine honest cases end at 1.0 to 1.4, an object cut by the view beyond 2."""
+MISFIT_SHARE = 0.02
+"""Rms residual over the rms line integral below which no misfit is large: finer than any voxel grid models an edge."""
+
+UNDETERMINED = 0.6
+"""Posterior over prior standard uncertainty from which a direction counts as not determined by the images: the images
+then hold less than twice the information that the prior had."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineSettings:
+    """How the images are matched.
+
+    levels:    binning of images and grid, coarse to fine; binnings that leave fewer than 24 pixels are passed over.
+    steps:     most Gauss-Newton steps on a level.
+    turns:     conjugate gradients in a step.
+    held_out:  share of the pixels, in blocks, that judges the result and takes no part in the fit.
+    sigma_px:  prior standard uncertainty of a view where nothing states one; None: what the matrices state, else 1 px.
+    samples:   draws of noise from which the uncertainty with the volume unknown is estimated.
+    halves:    whether two disjoint halves of the views are refined apart, as a second opinion on the uncertainty.
+    threads:   processors to use; None for all.
+    seed:      of the held-out blocks and the draws.
+    """
+
+    levels: tuple[int, ...] = (4, 2, 1)
+    steps: int = 8
+    turns: int = 12
+    held_out: float = 0.08
+    sigma_px: float | None = None
+    samples: int = 8
+    halves: bool = True
+    threads: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.levels or any(int(f) != f or f < 1 for f in self.levels):
+            raise InputError(f"levels are {self.levels!r}; positive whole binning factors are needed")
+        if not 0.01 <= self.held_out <= 0.5:
+            raise InputError(f"held_out is {self.held_out!r}; a share from 0.01 to 0.5 is needed")
+        if self.sigma_px is not None and not 0 < self.sigma_px < float("inf"):
+            raise InputError(f"sigma_px is {self.sigma_px!r}; a positive number of pixels is needed")
+        for name, least in (("steps", 1), ("turns", 1), ("samples", 4)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name} is {getattr(self, name)!r}; at least {least} is needed")
