@@ -64,7 +64,13 @@ def ellipsoids(seed: int = 3, mu: float = 0.02) -> list[Solid]:
         c = rng.uniform(-3.5, 3.5, 3)
         turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         out.append(
-            Solid(kind="ellipsoid", centre=tuple(c), half=tuple(rng.uniform(0.6, 1.8, 3)), mu=mu * rng.uniform(-0.9, 2), turn=turn)
+            Solid(
+                kind="ellipsoid",
+                centre=tuple(c),
+                half=tuple(rng.uniform(0.6, 1.8, 3)),
+                mu=mu * rng.uniform(-0.9, 2),
+                turn=turn,
+            )
         )
     return out
 
@@ -87,7 +93,11 @@ def rotation(w: np.ndarray) -> np.ndarray:
     K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
     K = K - np.swapaxes(K, -1, -2)
     a = np.where(angle > 1e-12, angle, 1)
-    return np.eye(3) + np.where(angle > 1e-12, np.sin(angle) / a, 1) * K + np.where(angle > 1e-12, (1 - np.cos(angle)) / a**2, 0.5) * K @ K
+    return (
+        np.eye(3)
+        + np.where(angle > 1e-12, np.sin(angle) / a, 1) * K
+        + np.where(angle > 1e-12, (1 - np.cos(angle)) / a**2, 0.5) * K @ K
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +128,7 @@ def matrices(R: np.ndarray, t: np.ndarray, panel: Panel) -> np.ndarray:
     """P (n, 3, 4): the object turned by R and shifted by t; source at -y, axis v along z."""
     to_camera = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, 1.0, 0]])
     M = panel.K @ to_camera @ R
-    last = (panel.K @ (to_camera @ t[..., None] + np.array([0, 0, panel.d_SR])[:, None]))
+    last = panel.K @ (to_camera @ t[..., None] + np.array([0, 0, panel.d_SR])[:, None])
     return np.concatenate([M, last], axis=2)
 
 
@@ -163,8 +173,15 @@ def errors(kind: str, n: int, seed: int, panel: Panel) -> np.ndarray:
 
 
 def scan(
-    obj: str = "balls", way: str = "seven", kind: str = "white", *, n: int = 64, seed: int = 0, noise: float = 0.005,
-    hardening: float = 0.0, panel: Panel | None = None,
+    obj: str = "balls",
+    way: str = "seven",
+    kind: str = "white",
+    *,
+    n: int = 64,
+    seed: int = 0,
+    noise: float = 0.005,
+    hardening: float = 0.0,
+    panel: Panel | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Panel]:
     """images (n, n_v, n_u) transmissions with noise, P as calibrated, P true, panel."""
     panel = panel or Panel()

@@ -178,6 +178,10 @@ from .reconstruction.settings import OSSART as OSSART
 from .reconstruction.settings import SART as SART
 from .reconstruction.settings import EarlierOptions as EarlierOptions
 from .reconstruction.settings import Execution as Execution
+from .refinement.result import Refinement as Refinement
+from .refinement.result import write_refinement as write_refinement
+from .refinement.run import refine as refine
+from .refinement.settings import RefineSettings as RefineSettings
 from .report.notebook import PlotlyFigure as PlotlyFigure
 from .report.notebook import plot_detections as plot_detections
 from .report.notebook import plot_observability as plot_observability

@@ -49,6 +49,7 @@ VERBS = (
     "matrices",
     "export",
     "import_geometry",
+    "refine",
     "reconstruct",
     "measure",
     "compare",

@@ -65,6 +65,11 @@ class CorrectionOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CorrectedImages(CorrectionOptions, ImageFileOptions):
+    """Image files, and how they become line integrals."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class AlgorithmOptions:
     """What is calculated, and by which engine."""
 
@@ -113,7 +118,7 @@ class ExecutionOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(CorrectionOptions, ImageFileOptions, AlgorithmOptions, ExecutionOptions, WritingOptions):
+class Options(CorrectedImages, AlgorithmOptions, ExecutionOptions, WritingOptions):
     """The options of `tomopose reconstruct`."""
 
     matrices: Annotated[Path, typer.Option("--matrices", help="matrices.npz of the scan.")]
@@ -158,13 +163,13 @@ def spacing(text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def grid_of(o: Options) -> VoxelGrid:
+def grid_from(*, voxel: str, size: str, centre: str) -> VoxelGrid:
     """The grid that --size, --voxel-mm and --centre-mm describe."""
     import numpy as np
 
     import tomopose as tp
 
-    return tp.VoxelGrid(shape=grid_size(o.size), spacing=np.array(spacing(o.voxel)), centre=np.array(point(o.centre)))
+    return tp.VoxelGrid(shape=grid_size(size), spacing=np.array(spacing(voxel)), centre=np.array(point(centre)))
 
 
 def polynomial(scene: Path | None, material: str | None, thickness: float | None) -> tuple[float, ...]:
@@ -209,7 +214,7 @@ def algorithm_from(o: AlgorithmOptions) -> Algorithm | None:
     return with_options(asked, given)
 
 
-def correction_from(o: Options, rows: Rows) -> Correction:
+def correction_from(o: CorrectedImages, rows: Rows) -> Correction:
     """How the images become line integrals; rows: the order of rows that the images were opened with."""
     import tomopose as tp
 
@@ -253,7 +258,7 @@ def reconstruct(options: Options) -> int:
     from tomopose.provenance import provenance
 
     o, say = options, options.say
-    grid, algorithm = grid_of(o), algorithm_from(o)
+    grid, algorithm = grid_from(voxel=o.voxel, size=o.size, centre=o.centre), algorithm_from(o)
     target = require_absent(o.out, force=o.force)
     for name in (*(f"{o.out.stem}_{picture}.png" for picture in PICTURES), f"{o.out.stem}.html"):
         require_absent(o.out.with_name(name), force=o.force)

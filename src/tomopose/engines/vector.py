@@ -340,7 +340,8 @@ def derivative_block(
 ) -> Intrinsic:
     """As `forward_block`, with the slopes in the same walk: five sums for each of W rays.
 
-    sums (5 W,): of the volume f, df/da, (k - centre) df/da, df/db and (k - centre) df/db, over the planes k_0 <= k < k_1.
+    sums (5 W,): of the volume f, df/da, (k - centre) df/da, df/db and (k - centre) df/db, over the planes
+    k_0 <= k < k_1.
     """
     signature = types.void(
         volume,

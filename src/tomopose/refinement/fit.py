@@ -46,9 +46,7 @@ def matrices_of(data: Measured, q: Array) -> ProjectionMatrices:
     """The matrices of a level with the motions q."""
     m = data.matrices
     P = m.P @ transforms(q, np.asarray(data.grid.centre))
-    return ProjectionMatrices(
-        P=P, n_u=m.n_u, n_v=m.n_v, p_u=m.p_u, p_v=m.p_v, pose_id=m.pose_id, in_front=m.in_front
-    )
+    return ProjectionMatrices(P=P, n_u=m.n_u, n_v=m.n_v, p_u=m.p_u, p_v=m.p_v, pose_id=m.pose_id, in_front=m.in_front)
 
 
 def lines_of(engine: CpuEngine, state: np.ndarray, n: int) -> Array:
@@ -77,15 +75,14 @@ class Fit:
 
     def __call__(self, data: Measured, start: State) -> State:
         """Steps from `start` to a minimum of the joint cost, or until they are used up."""
-        state, n = start, len(data.p)
+        state = start
         if not state.volume.any():
             state = self._step(data, state, held=True)[0]
         settled, taken = False, 0
-        for taken in range(1, self.steps + 1):
+        while taken < self.steps and not settled:
+            taken += 1
             state, gain = self._step(data, state, held=self.precision is None)
             settled = gain < SETTLED
-            if settled:
-                break
         return replace(state, steps=start.steps + taken, settled=settled)
 
     def _step(self, data: Measured, state: State, *, held: bool) -> tuple[State, float]:
@@ -131,7 +128,13 @@ class Fit:
         return replace(state, chi=chi, information=None if held else normal_blocks(J[:, :6], w)), 0.0
 
     def _tried(
-        self, data: Measured, state: State, engine: CpuEngine, x: np.ndarray, step: tuple[float, np.ndarray, Array], *,
+        self,
+        data: Measured,
+        state: State,
+        engine: CpuEngine,
+        x: np.ndarray,
+        step: tuple[float, np.ndarray, Array],
+        *,
         held: bool,
     ) -> tuple[State, np.ndarray]:
         """The state after part of a step, and its volume as the engine holds it."""

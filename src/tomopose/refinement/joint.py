@@ -6,8 +6,8 @@ residual r, weights W, the projector A and the views' derivatives J the step min
     |W^(1/2) (r - A dx - J dq)|^2  +  (q + dq)' C^-1 (q + dq)  +  lambda |x + dx|^2.
 
 dq is eliminated exactly, with the whole precision C^-1, correlated over views:  M = J'WJ + C^-1 (Cholesky); the volume
-is found by conjugate gradients on the Schur complement  A'WA - A'WJ M^-1 J'WA + lambda, over the voxels that are free to
-move (`free`: not held at zero by the bound).
+is found by conjugate gradients on the Schur complement  A'WA - A'WJ M^-1 J'WA + lambda, over the voxels that are free
+to move (`free`: not held at zero by the bound).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Linear:
     @classmethod
     def of(cls, engine: CpuEngine, free: np.ndarray, J: Array, w: Array, precision: Array, ridge: float) -> Linear:
         """Factorise M = J'WJ + precision (n d, n d)."""
-        n, d = J.shape[:2]
+        d = J.shape[1]
         M = precision.copy()
         for j, block in enumerate(normal_blocks(J, w)):
             M[j * d : j * d + d, j * d : j * d + d] += block
@@ -67,7 +67,9 @@ class Linear:
         """J q, (n, N), float32."""
         return np.asarray(np.einsum("ndp,nd->np", self.J, q.astype(np.float32)))
 
-    def solve(self, r: Array, pull: Array, x: np.ndarray, *, turns: int, tolerance: float = 1e-3) -> tuple[np.ndarray, Array]:
+    def solve(
+        self, r: Array, pull: Array, x: np.ndarray, *, turns: int, tolerance: float = 1e-3
+    ) -> tuple[np.ndarray, Array]:
         """(dx, dq) for the residual r (n, N); pull: C^-1 q, flat; x: the volume, for the ridge."""
 
         def reduced(y: Array) -> Array:

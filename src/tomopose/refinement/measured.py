@@ -1,7 +1,9 @@
-"""The images as the fit takes them: line integrals, their noise, and the blocks of pixels that judge it."""
+"""The images as the fit takes them: line integrals, their noise, the blocks of pixels that judge it, and the rays that
+meet what lies beyond the grid."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +22,12 @@ LEAST_NOISE = 2e-4
 voxels leaves of an exact line integral's rounding."""
 NORMAL_MEDIAN = 1.4826
 """Standard deviation over median absolute deviation of a normal distribution."""
+
+MATTER = 0.15
+"""Share of the volume's dense values (99.9 %) from which a voxel of the outermost layers counts as matter."""
+CROSSED = 0.05
+"""Share of a face's voxels that are matter from which the object crosses it: noise and streaks fill less."""
+FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +84,8 @@ def held_out_blocks(shape: tuple[int, int, int], share: float, seed: int) -> Arr
 
 
 def noise_variance(p: Array, good: Array) -> Array:
-    """Variance of each pixel of (n, n_u, n_v), found from the images: a + b e^p, counts and what does not depend on them.
+    """Variance of each pixel of (n, n_u, n_v), found from the images: a + b e^p, of counts and
+    of what does not depend on them.
 
     The difference of a pixel and the mean of its two neighbours along u has 1.5 times the variance of a pixel; its
     median absolute deviation, in classes of p, does not see edges.  p is smoothed for the law, so that a pixel's weight
@@ -91,7 +100,7 @@ def noise_variance(p: Array, good: Array) -> Array:
     ends = np.unique(np.quantile(at, np.linspace(0, 1, 13)))
     floor = (LEAST_NOISE * float(np.quantile(p, 0.999))) ** 2
     centre, found = [], []
-    for low, high in zip(ends[:-1], ends[1:], strict=True):
+    for low, high in itertools.pairwise(ends):
         inside = d[(at >= low) & (at <= high)]
         if inside.size >= 50:
             centre.append(0.5 * (low + high))
@@ -144,3 +153,39 @@ def finer(values: np.ndarray, coarse: VoxelGrid, fine: VoxelGrid) -> np.ndarray:
         indexing="ij",
     )
     return np.asarray(scipy.ndimage.map_coordinates(values, at, order=1, mode="nearest"), dtype=np.float32)
+
+
+def crossed_faces(volume: np.ndarray) -> tuple[str, ...]:
+    """Faces of the grid through which the object [z, y, x] leaves it."""
+    dense = float(np.quantile(volume, 0.999))
+    if dense <= 0:
+        return ()
+    faces = []
+    for axis, name in ((2, "x"), (1, "y"), (0, "z")):
+        layers = np.moveaxis(volume, axis, 0)
+        for sign, outer in (("-", layers[:2]), ("+", layers[-2:])):
+            if float(np.mean(outer.mean(axis=0) > MATTER * dense)) > CROSSED:
+                faces.append(sign + name)
+    return tuple(sorted(faces, key=FACES.index))
+
+
+def rays_through(data: Measured, faces: tuple[str, ...]) -> Array:
+    """bool (n, N): rays that enter or leave the grid through one of the faces."""
+    m, grid = data.matrices, data.grid
+    low, high = grid.corners.min(axis=0), grid.corners.max(axis=0)
+    u, v = np.meshgrid(np.arange(m.n_u), np.arange(m.n_v), indexing="ij")
+    pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
+    result = np.zeros(data.p.shape, dtype=bool)
+    for j, P in enumerate(m.P):
+        M_inv = np.linalg.inv(P[:, :3])
+        s, d = -M_inv @ P[:, 3], (M_inv @ pixels).T
+        d = np.where(np.abs(d) < 1e-12, 1e-12, d)
+        t_low, t_high = (low - s) / d, (high - s) / d
+        near, far = np.minimum(t_low, t_high), np.maximum(t_low, t_high)
+        enter, leave = near.argmax(axis=1), far.argmin(axis=1)
+        meets = near.max(axis=1) < far.min(axis=1)
+        for face in faces:
+            axis, up = "xyz".index(face[1]), face[0] == "+"
+            inwards = (d[:, axis] < 0) == up
+            result[j] |= meets & (((enter == axis) & inwards) | ((leave == axis) & ~inwards))
+    return result

@@ -53,7 +53,9 @@ def without_gauge(q: Array, G: Array, precision: Array) -> Array:
     # the size's column is a thousand times larger than the others
     scale = 1 / np.sqrt(np.maximum(np.einsum("ij,ij->j", g, K), 1e-300))
     inner = (g * scale).T @ (K * scale)
-    return np.asarray(flat - (g * scale) @ np.linalg.lstsq(inner, (K * scale).T @ flat, rcond=1e-10)[0]).reshape(q.shape)
+    return np.asarray(flat - (g * scale) @ np.linalg.lstsq(inner, (K * scale).T @ flat, rcond=1e-10)[0]).reshape(
+        q.shape
+    )
 
 
 def pixel_jacobian(P: Array, points: Array, centre: Array) -> Array:

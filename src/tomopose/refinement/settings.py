@@ -19,6 +19,13 @@ On the scans of benchmarks/refine honest cases end at 1.0 to 1.4, an object cut 
 MISFIT_SHARE = 0.02
 """Rms residual over the rms line integral below which no misfit is large: finer than any voxel grid models an edge."""
 
+LEAST_PIXELS = 40
+"""Pixels of an image, along its shorter side, below which no level is fitted: at 27 pixels the steps of a step cylinder
+led away from its minimum."""
+MOST_SAMPLES = 2e9
+"""Samples along all rays of a scan up to which a level is fitted: about a minute for each conjugate gradient on two
+processors.  Images of more pixels hold little more about the poses than those binned to this size."""
+
 UNDETERMINED = 0.6
 """Posterior over prior standard uncertainty from which a direction counts as not determined by the images: the images
 then hold less than twice the information that the prior had."""
@@ -28,29 +35,27 @@ then hold less than twice the information that the prior had."""
 class RefineSettings:
     """How the images are matched.
 
-    levels:    binning of images and grid, coarse to fine; binnings that leave fewer than 24 pixels are passed over.
+    levels:    binning of images and grid, coarse to fine; None: 4, 2, 1 where 40 pixels remain and the work allows it.
     steps:     most Gauss-Newton steps on a level.
     turns:     conjugate gradients in a step.
     held_out:  share of the pixels, in blocks, that judges the result and takes no part in the fit.
     sigma_px:  prior standard uncertainty of a view where nothing states one; None: what the matrices state, else 1 px.
     samples:   draws of noise from which the uncertainty with the volume unknown is estimated.
-    halves:    whether two disjoint halves of the views are refined apart, as a second opinion on the uncertainty.
     threads:   processors to use; None for all.
     seed:      of the held-out blocks and the draws.
     """
 
-    levels: tuple[int, ...] = (4, 2, 1)
+    levels: tuple[int, ...] | None = None
     steps: int = 8
     turns: int = 12
     held_out: float = 0.08
     sigma_px: float | None = None
     samples: int = 8
-    halves: bool = True
     threads: int | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not self.levels or any(int(f) != f or f < 1 for f in self.levels):
+        if self.levels is not None and (not self.levels or any(int(f) != f or f < 1 for f in self.levels)):
             raise InputError(f"levels are {self.levels!r}; positive whole binning factors are needed")
         if not 0.01 <= self.held_out <= 0.5:
             raise InputError(f"held_out is {self.held_out!r}; a share from 0.01 to 0.5 is needed")

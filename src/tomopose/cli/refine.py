@@ -1,0 +1,142 @@
+"""`tomopose refine`: each view's geometry corrected from the scan's own images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tomopose.cli.common import NOT_TRUSTWORTHY, OK, arguments
+from tomopose.cli.options import WritingOptions, add_command
+from tomopose.cli.reconstruct import CorrectedImages, correction_from, grid_from
+
+if TYPE_CHECKING:
+    from tomopose import Provenance, Refinement
+
+EPILOG = (
+    "Example: tomopose refine --matrices matrices.npz --images scan/ --images-are transmission --voxel-mm 0.1 "
+    "--size 256 --out refined/   then use refined/matrices.npz with reconstruct and export"
+)
+FILES = ("matrices.npz", "refined.json", "report.html")
+
+
+def register(app: typer.Typer) -> None:
+    add_command(app, "refine", refine, epilog=EPILOG)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(CorrectedImages, WritingOptions):
+    """The options of `tomopose refine`."""
+
+    matrices: Annotated[Path, typer.Option("--matrices", help="matrices.npz of the scan, as calibrated.")]
+    images: Annotated[str, typer.Option("--images", help="Folder, glob or multi-page file of the scan's images.")]
+    voxel: Annotated[str, typer.Option("--voxel-mm", help="Side of a voxel, mm: one number, or X,Y,Z.")]
+    size: Annotated[str, typer.Option("--size", help="Voxels along each axis, N or NX,NY,NZ: the whole object.")]
+    out: Annotated[Path, typer.Option("--out", help="Folder for matrices.npz, refined.json and report.html.")]
+    centre: Annotated[str, typer.Option("--centre-mm", help="Middle of the volume in W, X,Y,Z.")] = "0,0,0"
+    calibration: Annotated[
+        Path | None, typer.Option("--calibration", help="calibration.json that the matrices were made from.")
+    ] = None
+    scanner: Annotated[
+        Path | None, typer.Option("--scanner", help="scanner.json, for the row order and size of the image files.")
+    ] = None
+    sigma: Annotated[
+        float | None,
+        typer.Option("--sigma-px", help="Prior uncertainty of a view, px; default: what the matrices state, else 1."),
+    ] = None
+    seed: Annotated[int, typer.Option("--seed", help="Random seed of the held-out blocks and the draws.")] = 0
+    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processors to use; all unless given.")] = None
+
+
+def refine(options: Options) -> int:
+    """Correct each view's geometry from the scan's own images.
+
+    Volume and poses are estimated together.  The correction is kept only where pixels that took no part in the fit
+    confirm it; else matrices.npz holds the input's matrices.  Where the images do not determine a correction (an object
+    beyond the grid, a symmetric part) the exit code is 3 and the report names the direction.
+    """
+    import tomopose as tp
+    from tomopose.cli.job import image_source, open_for
+    from tomopose.files import require_absent
+    from tomopose.provenance import provenance
+
+    o, say = options, options.say
+    grid = grid_from(voxel=o.voxel, size=o.size, centre=o.centre)
+    for name in FILES:
+        require_absent(o.out / name, force=o.force)
+    P = tp.read_matrices(o.matrices)
+    calibration = None if o.calibration is None else tp.read_calibration(o.calibration)
+    known: Any = None if o.scanner is None else tp.read_scanner(o.scanner)
+    stack = open_for(
+        say, image_source(o.images), known, None, dark=o.dark, flat=o.flat, dataset=o.dataset, rows=o.rows, raw=o.raw
+    )
+    correction = correction_from(o, stack.rows)
+    settings = tp.RefineSettings(sigma_px=o.sigma, seed=o.seed, threads=o.workers)
+    with say.progress("refining") as progress:
+        result = tp.refine(stack, P, grid, calibration, correction=correction, settings=settings, progress=progress)
+    inputs = [path for path in (o.matrices, o.calibration, o.scanner, o.bad_pixels, o.scene) if path is not None]
+    asked = arguments(
+        voxel_mm=o.voxel, size=o.size, centre_mm=o.centre, images_are=o.images_are, verdict=result.verdict,
+        **(dict(result.provenance.arguments) if result.provenance else {}),
+    )  # fmt: skip
+    write(o, result, provenance(inputs=inputs, arguments=asked, seed=o.seed))
+    said(o, result)
+    return OK if result.trustworthy else NOT_TRUSTWORTHY
+
+
+def write(o: Options, result: Refinement, made: Provenance) -> None:
+    """The three files; `made` is the provenance block of all of them."""
+    from dataclasses import replace
+
+    import tomopose as tp
+    from tomopose.report import write_report
+    from tomopose.report.pages.refine_page import RefinedViews, refinement_report
+
+    result = replace(result, provenance=made)
+    o.out.mkdir(parents=True, exist_ok=True)
+    tp.write_matrices(o.out / "matrices.npz", result.matrices, provenance=made, force=o.force)
+    tp.write_refinement(o.out / "refined.json", result, force=o.force)
+    page = RefinedViews(
+        columns=result.columns(),
+        verdict=result.verdict,
+        reasons=result.reasons,
+        unobservable=result.unobservable,
+        gain=result.held_out_gain,
+        before=result.volume_before,
+        after=result.volume,
+        provenance=made,
+    )
+    write_report(o.out / "report.html", refinement_report(page))
+
+
+def said(o: Options, result: Refinement) -> None:
+    """The result in words, or as JSON."""
+    import numpy as np
+
+    sigma = result.matrices.points_sigma
+    o.say.result(
+        {
+            "out": o.out.name,
+            "verdict": result.verdict,
+            "trustworthy": result.trustworthy,
+            "reasons": list(result.reasons),
+            "unobservable": list(result.unobservable),
+            "iterations": result.iterations,
+            "converged": result.converged,
+            "median_residual_before": float(np.median(result.residual_before)),
+            "median_residual_after": float(np.median(result.residual_after)),
+            "points_sigma_px": None if sigma is None else float(np.sqrt(np.mean(sigma**2))),
+            "jumps": [result.pose_id[j] for j in result.outliers],
+        },
+        [
+            f"{o.out}: {result.verdict}; matrices.npz, refined.json and report.html",
+            *(f"  {reason}" for reason in result.reasons),
+            f"  residual of a view, median: {np.median(result.residual_before):.3g} before, "
+            f"{np.median(result.residual_after):.3g} after",
+            *([] if sigma is None else [f"  standard uncertainty of a view: {np.sqrt(np.mean(sigma**2)):.3g} px"]),
+            *(f"  view {result.pose_id[j]} stands out from the others" for j in result.outliers),
+            *(f"  note: {sentence}" for sentence in result.unobservable),
+        ],
+    )

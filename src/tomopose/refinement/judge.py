@@ -1,0 +1,114 @@
+"""Pixels that took no part in the fit decide whether the correction is kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+
+from tomopose.engines.cpu import CpuEngine
+from tomopose.refinement.fit import Fit, State, blank, lines_of, matrices_of
+from tomopose.refinement.measured import Measured
+from tomopose.refinement.settings import MISFIT, MISFIT_SHARE, SIGNIFICANCE
+from tomopose.units import Array
+
+
+class Verdict(Enum):
+    """What became of the correction."""
+
+    REFINED = "refined"
+    UNCHANGED = "unchanged"
+    UNDETERMINED = "undetermined"
+
+    @property
+    def trustworthy(self) -> bool:
+        """Whether the matrices may be used as they are returned."""
+        return self is not Verdict.UNDETERMINED
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """before, after: (n,) rms residual of each view's held-out pixels over their noise, with the input's geometry and
+    with the refined one, each with a volume fitted to the same other pixels.
+
+    gain: mean gain of the views' chi square in standard errors; residual_before, residual_after: (n,) rms over all
+    pixels, relative to the view's line integrals.
+    """
+
+    before: Array
+    after: Array
+    gain: float
+    residual_before: Array
+    residual_after: Array
+
+
+def trial(data: Measured, refined: State, fit: Fit) -> tuple[Trial, State, State]:
+    """Refit the volume under both geometries, from nothing and with the same number of steps, and compare.
+
+    Returns the comparison, and both states (volumes for the pictures).
+    """
+    volume_only = replace(fit, precision=None)
+    states, squares, residuals = [], [], []
+    for q in (np.zeros_like(refined.q), refined.q):
+        state = volume_only(data, replace(blank(data), q=q))
+        r = residual(data, state, threads=fit.threads)
+        squares.append(np.einsum("np,np,np->n", data.judge, r, r, dtype=np.float64))
+        size = np.sqrt(np.einsum("np,np->n", data.p, data.p, dtype=np.float64))
+        residuals.append(np.sqrt(np.einsum("np,np->n", r, r, dtype=np.float64)) / np.maximum(size, 1e-30))
+        states.append(state)
+    count = np.maximum((data.judge > 0).sum(axis=1), 1)
+    gains = (squares[0] - squares[1]) / count
+    error = float(np.std(gains, ddof=1)) / np.sqrt(len(gains)) if len(gains) > 1 else float("inf")
+    mean = float(np.mean(gains))
+    # one view that jumps is a gain although the spread over the views is as large: its own pixels say so
+    noise = np.sqrt(2 * np.mean(squares[1] / count) ** 2 * 2 / count)
+    single = float(np.max(gains / noise)) - 2.0
+    return (
+        Trial(
+            before=np.sqrt(squares[0] / count),
+            after=np.sqrt(squares[1] / count),
+            gain=max(mean / max(error, 1e-30), min(single, 1e3) if mean > 0 else -np.inf),
+            residual_before=residuals[0],
+            residual_after=residuals[1],
+        ),
+        states[0],
+        states[1],
+    )
+
+
+def residual(data: Measured, state: State, *, threads: int) -> Array:
+    """Measured minus projected line integrals (n, N)."""
+    engine = CpuEngine(matrices_of(data, state.q), data.grid, threads=threads)
+    lines = lines_of(engine, engine.put(state.volume), len(data.p))
+    return np.asarray(data.p - lines - state.offset[:, None].astype(np.float32))
+
+
+def decide(
+    held_out: Trial, *, chi: float, cut: tuple[str, ...], left: float, open_: tuple[str, ...]
+) -> tuple[Verdict, tuple[str, ...]]:
+    """The verdict and its reasons, as sentences.
+
+    chi: rms residual over noise of the fit; cut: faces of the grid that the object crosses; left: share of the rays
+    that do not meet what lies beyond them; open_: directions that the images do not determine.
+    """
+    reasons: list[str] = []
+    misfit = float(np.median(held_out.residual_after))
+    if cut:
+        reasons.append(
+            f"The object reaches beyond the grid ({', '.join(cut)}); {100 * left:.0f} % of the rays do not meet what "
+            "lies there. Use a grid that holds the whole object"
+        )
+    if chi > MISFIT and misfit > MISFIT_SHARE:
+        reasons.append(
+            f"The residual is {chi:.1f} times the images' noise ({100 * misfit:.1f} % of the line integrals): the "
+            "volume does not explain the images (object cut by the view or the grid, scatter, or wrong matrices)"
+        )
+    gain = f"held-out pixels gain {held_out.gain:.1f} standard errors, {SIGNIFICANCE:g} are needed"
+    if cut:
+        return Verdict.UNDETERMINED, tuple(reasons)
+    if reasons or open_:
+        return Verdict.UNDETERMINED, (*reasons, *open_)
+    if held_out.gain < SIGNIFICANCE:
+        return Verdict.UNCHANGED, (f"Nothing is gained by a correction: {gain}",)
+    return Verdict.REFINED, (f"Pixels kept out of the fit agree: they gain {held_out.gain:.1f} standard errors",)

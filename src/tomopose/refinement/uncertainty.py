@@ -1,0 +1,143 @@
+r"""How exact each view is after the fit, with the volume unknown, and which directions the images leave open.
+
+The motions' covariance is the inverse of the reduced normal equations, the volume eliminated.  Its size comes from
+draws: noise of the weights' size and motions of the prior's are put into the linearised problem, whose own step answers
+with an error of exactly that covariance.  The draws give, point by point, how much larger the uncertainty is than with
+the volume known; the views' own blocks give how it differs from view to view.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tomopose.engines.cpu import CpuEngine
+from tomopose.refinement.derivatives import integrals_with_derivatives
+from tomopose.refinement.fit import LEVEL_SIGMA, State, matrices_of, robust_weights
+from tomopose.refinement.joint import Linear, normal_blocks
+from tomopose.refinement.measured import Measured
+from tomopose.refinement.motions import gauge, pixel_jacobian, without_gauge
+from tomopose.refinement.prior import Prior
+from tomopose.refinement.settings import UNDETERMINED
+from tomopose.units import Array
+
+VOLUME_UNKNOWN = 9.0
+"""Factor of variance by which an unknown volume widens the motions before draws have measured it: simulated scans of
+balls and step cylinders show 3 to 4 in the standard deviation."""
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """sigma: (n, 6), mm and rad, of each view's motion; points_sigma: (n, m), px per coordinate; widening: ratio of the
+    draws' standard deviation to that with the volume known."""
+
+    sigma: Array
+    points_sigma: Array
+    widening: float
+
+
+def drawn_errors(
+    data: Measured, state: State, prior: Prior, *, samples: int, turns: int, threads: int, seed: int
+) -> Array:
+    """Errors (samples, n, 6) of the motions that noise and prior of their own size make."""
+    n = len(data.p)
+    matrices = matrices_of(data, state.q)
+    engine = CpuEngine(matrices, data.grid, threads=threads)
+    x = engine.put(state.volume)
+    images, slopes = integrals_with_derivatives(x, matrices, data.grid, range(n), threads=threads)
+    ones = np.ones((n, 1, data.p.shape[1]), dtype=np.float32)
+    J = np.concatenate([slopes.transpose(0, 1, 3, 2).reshape(n, 6, -1), ones], axis=1)
+    r = data.p - images.transpose(0, 2, 1).reshape(n, -1) - state.offset[:, None].astype(np.float32)
+    w, _ = robust_weights(r, data.weight, first=False)
+    C, at = prior.covariance, (7 * np.arange(n)[:, None] + np.arange(6)).ravel()
+    own = np.linalg.inv(C)
+    precision = np.eye(7 * n) / LEVEL_SIGMA**2
+    precision[np.ix_(at, at)] = own
+    ridge = 1.0 / max(float(np.mean(state.volume[state.volume > 0] ** 2)), 1e-30)
+    linear = Linear.of(engine, x > 0, J, w, precision, ridge)
+    rng, root = np.random.default_rng([seed, 21]), np.linalg.cholesky(C + 1e-15 * np.trace(C) * np.eye(len(C)))
+    G, sigma = (
+        gauge(data.matrices.P, np.asarray(data.grid.centre)),
+        np.where(w > 0, 1 / np.sqrt(np.maximum(w, 1e-30)), 0),
+    )
+    errors = np.empty((samples, n, 6))
+    for k in range(samples):
+        truth = np.zeros((n, 7))
+        truth[:, :6] = (root @ rng.standard_normal(6 * n)).reshape(n, 6)
+        truth[:, 6] = LEVEL_SIGMA * rng.standard_normal(n)
+        noise = (sigma * rng.standard_normal(sigma.shape)).astype(np.float32)
+        _, dq = linear.solve(noise, -(precision @ truth.ravel()), np.zeros_like(x), turns=turns)
+        errors[k] = without_gauge(dq[:, :6], G, own)
+    return errors
+
+
+def spread_of(errors: Array, information: Array, prior: Prior, K: Array) -> Spread:
+    """Per view and point, from draws (s, n, 6), each view's information (n, 6, 6) and K (n, m, 2, 6), px per motion."""
+    n = len(information)
+    blocks = np.stack([prior.covariance[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] for j in range(n)])
+    known = np.linalg.inv(information + np.linalg.inv(blocks))
+    drawn = np.einsum("nmic,snc->snmi", K, errors)
+    with_volume_known = np.einsum("nmic,ncd,nmid->nmi", K, known, K)
+    ratio = np.maximum((drawn**2).mean(axis=(0, 1)) / with_volume_known.mean(axis=0), 1.0)  # (m, 2)
+    variance = with_volume_known * ratio
+    of_motion = np.maximum((errors**2).mean(axis=(0, 1)) / np.einsum("ncc->c", known) * n, 1.0)
+    prior_points = np.einsum("nmic,ncd,nmid->nmi", K, blocks, K)
+    variance = np.minimum(variance, np.maximum(prior_points, with_volume_known))
+    return Spread(
+        sigma=np.sqrt(np.minimum(np.einsum("ncc->nc", known) * of_motion, np.einsum("ncc->nc", blocks))),
+        points_sigma=np.sqrt(variance.mean(axis=2)),
+        widening=float(np.sqrt(ratio.mean())),
+    )
+
+
+def open_directions(information: Array, prior: Prior, radius: float) -> tuple[str, ...]:
+    """Directions of the object's frame that no view determines, as sentences.
+
+    information: (n, 6, 6) of the views with the volume held.  A direction is open where the images, the volume unknown,
+    leave more than `UNDETERMINED` of the prior that was stated.  radius: mm, of the object, in the words.
+    """
+    n = len(information)
+    stated = Prior(names=prior.names, parts=prior.parts, sizes=np.ones(len(prior.sizes))).covariance
+    blocks = np.stack([stated[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] for j in range(n)])
+    root = np.linalg.cholesky(blocks.mean(axis=0))
+    F = root.T @ (information.mean(axis=0) / VOLUME_UNKNOWN) @ root
+    values, vectors = np.linalg.eigh(F)
+    left = 1 / np.sqrt(1 + np.maximum(values, 0))
+    words = []
+    for share, vector in zip(left, vectors.T, strict=True):
+        if share > UNDETERMINED:
+            words.append(
+                f"{direction_in_words(root @ vector, radius)} is not determined by these images: they leave "
+                f"{100 * share:.0f} % of the prior's uncertainty"
+            )
+    return tuple(words)
+
+
+def direction_in_words(motion: Array, radius: float) -> str:
+    """A motion (t, w) as "motion along z" or "a turn about (0.6, 0.8, 0)"."""
+    t, w = motion[:3], motion[3:] * radius
+    turning = np.linalg.norm(w) > np.linalg.norm(t)
+    axis = w if turning else t
+    axis = axis / np.linalg.norm(axis)
+    k = int(np.abs(axis).argmax())
+    where = AXES[k] if abs(axis[k]) > 0.95 else "(" + ", ".join(f"{a:.2f}" for a in axis * np.sign(axis[k])) + ")"
+    return f"A turn of the object about {where}" if turning else f"Motion of the object along {where}"
+
+
+def information_blocks(data: Measured, state: State, *, threads: int) -> Array:
+    """J'WJ (n, 6, 6) of each view at a state, the volume held, weights scaled to the residual."""
+    n = len(data.p)
+    matrices = matrices_of(data, state.q)
+    x = CpuEngine(matrices, data.grid, threads=threads).put(state.volume)
+    images, slopes = integrals_with_derivatives(x, matrices, data.grid, range(n), threads=threads)
+    r = data.p - images.transpose(0, 2, 1).reshape(n, -1) - state.offset[:, None].astype(np.float32)
+    w, _ = robust_weights(r, data.weight, first=False)
+    J = slopes.transpose(0, 1, 3, 2).reshape(n, 6, -1)
+    return normal_blocks(J, w)
+
+
+def points_jacobian(data: Measured, points: Array) -> Array:
+    """(n, m, 2, 6) px per mm and rad."""
+    return pixel_jacobian(data.matrices.P, points, np.asarray(data.grid.centre))

@@ -1,0 +1,62 @@
+"""`refine` on a small scan whose line integrals are exact: better where views are off, never worse, exit codes."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+import tomopose as tp
+from tomopose.cli.main import run
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "refine"))
+import objects
+
+PANEL = objects.Panel(n_u=47, n_v=43, p_u=2.8, p_v=2.7, u_0=24.3, v_0=20.2)
+GRID = tp.VoxelGrid(shape=(32, 32, 32), spacing=0.63)
+
+
+def scan(kind, obj="balls"):
+    images, P, truth, _ = objects.scan(obj, "seven", kind, n=24, noise=0.004, panel=PANEL)
+    ids = tuple(f"p{j}" for j in range(len(P)))
+    return images, tp.ProjectionMatrices(P=P, n_u=47, n_v=43, p_u=2.8, p_v=2.7, pose_id=ids), truth
+
+
+@pytest.mark.slow
+def test_scattered_views_come_three_times_nearer_and_state_how_near():
+    images, matrices, truth = scan("white")
+    result = tp.refine(images, matrices, GRID, images_are="transmission", settings=tp.RefineSettings(threads=1))
+    before, after = (objects.error_px(np.asarray(m), truth) for m in (matrices, result.matrices))
+    assert result.verdict == "refined"
+    assert after < before / 3
+    assert result.matrices.points_sigma.shape == (24, 9)
+    assert result.matrices.pose_id == matrices.pose_id
+    assert any("calibration alone" in sentence for sentence in result.unobservable)
+
+
+@pytest.mark.slow
+def test_the_command_writes_matrices_json_and_report_and_refuses_an_object_beyond_the_grid(tmp_path, capsys):
+    images, matrices, _ = scan("white", "rod")
+    tp.write_matrices(tmp_path / "m.npz", matrices)
+    tifffile.imwrite(tmp_path / "scan.tif", images[:, ::-1].astype(np.float32))
+    words = f"refine --matrices {tmp_path}/m.npz --images {tmp_path}/scan.tif --images-are transmission --voxel-mm 0.63 "
+    code = run([*(words + f"--size 32 --workers 1 --out {tmp_path}/out --json").split()])
+    said = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert code == 3
+    assert said["verdict"] == "undetermined"
+    assert "-z, +z" in said["reasons"][0]
+    np.testing.assert_array_equal(np.asarray(tp.read_matrices(tmp_path / "out" / "matrices.npz")), np.asarray(matrices))
+    document = json.loads((tmp_path / "out" / "refined.json").read_text())
+    assert document["schema"] == "tomopose/refined/1"
+    assert len(document["views"]) == 24
+    assert "not observable" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_too_few_views_are_refused():
+    images, matrices, _ = scan("none")
+    with pytest.raises(tp.TomoposeError, match="7 views are too few"):
+        tp.refine(images[:7], matrices.select(slice(0, 7)), GRID, images_are="transmission")
