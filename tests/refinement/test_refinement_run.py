@@ -43,7 +43,9 @@ def test_the_command_writes_matrices_json_and_report_and_refuses_an_object_beyon
     images, matrices, _ = scan("white", "rod")
     tp.write_matrices(tmp_path / "m.npz", matrices)
     tifffile.imwrite(tmp_path / "scan.tif", images[:, ::-1].astype(np.float32))
-    words = f"refine --matrices {tmp_path}/m.npz --images {tmp_path}/scan.tif --images-are transmission --voxel-mm 0.63 "
+    words = (
+        f"refine --matrices {tmp_path}/m.npz --images {tmp_path}/scan.tif --images-are transmission --voxel-mm 0.63 "
+    )
     code = run([*(words + f"--size 32 --workers 1 --out {tmp_path}/out --json").split()])
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert code == 3
