@@ -40,7 +40,7 @@ def test_four_times_the_poses_take_four_times_the_memory(scanner, T_HT):
     peak_of_a_calibration(scanner, T_HT, 20)  # what is imported and compiled once is not a calibration's
     few, many = (peak_of_a_calibration(scanner, T_HT, n) for n in (100, 400))
     assert many < 5 * few
-    # Measured: 11.5 kB a centre, most of it the columns of the tests of the scanner's values.
+    # Measured: 11 kB a centre of these few, and 7 kB of every further one, where rows are looked at in parts.
     assert many < 13_000 * 400 * BALLS
 
 

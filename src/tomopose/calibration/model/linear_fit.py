@@ -38,10 +38,10 @@ class LinearFit:
         """(n, 2) residuals in standard deviations."""
         return (self.W @ self.r[:, :, None])[..., 0]
 
-    @cached_property
+    @property
     def J_white(self) -> Array:
-        """(n, 2, m) derivatives in standard deviations."""
-        return np.asarray(self.W @ self.J, dtype=np.float64)
+        """(n, 2, m) derivatives in standard deviations: a view of `rows`."""
+        return np.asarray(self.rows[: 2 * len(self.J)].reshape(self.J.shape))
 
     @property
     def J_mount(self) -> Array:
@@ -63,7 +63,11 @@ class LinearFit:
     @cached_property
     def rows(self) -> Array:
         """(2 n + k, m): centres and priors in standard deviations."""
-        return np.concatenate([self.J_white.reshape(-1, self.J.shape[2]), self.prior_rows])
+        n, m = len(self.J), self.J.shape[2]
+        rows = np.empty((2 * n + len(self.prior_rows), m))
+        np.matmul(self.W, self.J, out=rows[: 2 * n].reshape(n, 2, m))
+        rows[2 * n :] = self.prior_rows
+        return rows
 
     @cached_property
     def residuals(self) -> Array:
