@@ -25,8 +25,8 @@ MOST_EXCHANGES = 1500
 DUAL_STEPS, PATIENCE, DEFLECTION = 800, 20, 0.85
 """Of the subgradient method; after PATIENCE steps without a lower bound its step is halved (Held, Wolfe, Crowder 1974),
 and a step goes on along DEFLECTION of the one before (Camerini, Fratta, Maffioli 1975).  Tuned on the plate and the
-specimen of benchmarks/planning at 40 views: value over bound 0.979 and 0.986; 0.973 and 0.984 with 400 steps and 0.7,
-0.969 and 0.970 with 400 steps, 12 and no deflection."""
+specimen of benchmarks/planning at 40 views: value over bound 0.977 and 0.984; 0.969 and 0.970 with 400 steps, 12 and no
+deflection."""
 ENOUGH = 1e-4
 """By which share of it a bound has to fall to count as lower."""
 
