@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
 import pickle
 import sys
 import warnings
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+import tomopose as tp
 from tomopose import (
     BallObservations,
     PoseSequence,
@@ -161,3 +163,20 @@ def test_without_pandas_the_install_line_is_named(monkeypatch):
     with pytest.raises(EngineMissingError) as caught:
         make_poses().to_dataframe()
     assert caught.value.install_line == "pip install pandas"
+
+
+HELD_BY_IDENTITY = {"TriangleMesh"}
+"""The key of its own search tree's cache: a hash of all its vertices would cost more than the tree."""
+
+
+def test_every_public_value_with_arrays_is_compared_by_content():
+    """The comparison that a dataclass writes for itself raises ValueError for arrays, and its hash TypeError."""
+    wrong = []
+    for name in set(tp.__all__) - HELD_BY_IDENTITY:
+        kind = getattr(tp, name)
+        if not (inspect.isclass(kind) and is_dataclass(kind)) or issubclass(kind, Exception):
+            continue
+        holds_arrays = any(word in str(f.type) for f in fields(kind) for word in ("Array", "ndarray"))
+        if holds_arrays and kind.__eq__ is not tp.Volume.__eq__:
+            wrong.append(name)
+    assert sorted(wrong) == []

@@ -21,7 +21,7 @@ Source: the constraint equations of the Stewart-Gough platform, e.g. Merlet, Par
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from typing import Any
 
@@ -32,6 +32,7 @@ from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import RealPoses, Repeatability, left_jacobian, moved
 from tomopose.units import Array, float_array
+from tomopose.values import value
 
 NEWTON_STEPS = 30
 NEWTON_TOLERANCE = 1e-11
@@ -64,7 +65,7 @@ SINGULAR_CONDITION = 1e5
 """Condition of A (lengths in units of the platform's radius) above which a pose counts as singular."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Hexapod:
     """Nominal hexapod and how far its parts may be off.
 

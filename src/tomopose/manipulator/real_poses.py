@@ -17,6 +17,7 @@ from tomopose.geometry.rotations import exp_rotation
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.units import Array
+from tomopose.values import value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +44,7 @@ class Repeatability:
         return {"t_mm": self.t_mm, "w_rad": self.w_rad}
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class RealPoses:
     """n poses of the real plate and how they answer to the errors.
 

@@ -24,6 +24,7 @@ from tomopose.manipulator.inverse import InverseManipulator
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import ErrorModel, RealPoses, Repeatability, left_jacobian
 from tomopose.units import Array, float_array
+from tomopose.values import value
 
 SETUP = tuple(f"{what}_{c}" for what in ("base_w", "base_t", "focus") for c in "xyz")
 
@@ -34,7 +35,7 @@ def twin_names(detector: ErrorModel | None, source: ErrorModel | None) -> tuple[
     return (*(f"{who}_{name}" for who, machine in machines if machine is not None for name in machine.names), *SETUP)
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class SourcePlaces:
     """x (n, 3) mm: focal spots in M.  J (n, 3, m): their derivative by the errors.  covariance (n, 3, 3) mm^2: of the
     repeatability of the source's robot."""

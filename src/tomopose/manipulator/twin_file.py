@@ -15,7 +15,6 @@ the directions in which u and v grow.  These are starts; what is found replaces 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +38,7 @@ from tomopose.manipulator.real_poses import ErrorModel
 from tomopose.manipulator.twin import TwinRobots
 from tomopose.reading import reader
 from tomopose.units import Array, float_array
+from tomopose.values import value
 
 KEYS = (
     "schema",
@@ -62,7 +62,7 @@ NEAREST_BASES_MM = 20.0
 CONFIRM = 'convert them, or add "units": "confirmed" if the numbers are right'
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class TwinDrawing:
     """Twin robots before a run: machines (None: trusted), nominal setup, and the panel's place on its flange.
 

@@ -14,9 +14,10 @@ from tomopose.geometry.point_motion import rigid_motion
 from tomopose.geometry.rotations import exp_rotation, log_rotation
 from tomopose.measurement.features.shapes import frame_along
 from tomopose.units import Array, float_array
+from tomopose.values import value
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@value
 class Alignment:
     """x_W = R @ x_part + t.  R (3, 3), t (3,) mm; rule: how it was found."""
 

@@ -7,7 +7,7 @@ about them is read.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,11 +16,11 @@ from tomopose.errors import InputError
 from tomopose.measurement.features.shapes import frame_along
 from tomopose.measurement.surface.edges import Edges, EdgeSettings, search_edges
 from tomopose.units import Array, float_array
-from tomopose.values import require_types
+from tomopose.values import require_types, value
 from tomopose.volume import Volume
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@value
 class Probing:
     """points: (n, 3) probed, mm in W, nan without an edge;  start, normals: (n, 3) as given;  edges: details."""
 

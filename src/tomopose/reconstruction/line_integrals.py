@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from tomopose.errors import ConventionError, InputError, ShapeError
 from tomopose.geometry.projection import ProjectionMatrices
-from tomopose.values import Images
+from tomopose.values import Images, value
 
 ImagesAre = Literal["transmission", "line-integrals", "counts"]
 KINDS = ("transmission", "line-integrals", "counts")
@@ -21,7 +20,7 @@ LARGEST_HOLE = 25
 """Widest window, px, in which good neighbours of a bad pixel are looked for."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Correction:
     """How an image becomes line integrals.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -35,10 +35,10 @@ from tomopose.simulation.projector.meshes import add_mesh_transmission
 from tomopose.simulation.projector.rays import Compiled, compile_solids
 from tomopose.simulation.projector.view import View, enclosing, shadow
 from tomopose.units import Array, float_array
-from tomopose.values import require_types
+from tomopose.values import require_types, value
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class SimulatedRun:
     """A run of the virtual scanner, picklable: `render(run, i)` makes frame i anywhere, always with the same bytes.
 

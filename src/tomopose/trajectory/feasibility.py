@@ -5,8 +5,6 @@ Each question has a function that answers it with arrays, and one that raises wh
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -17,12 +15,13 @@ from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.units import Array, float_array
+from tomopose.values import value
 
 AXES = ("x", "y", "z", "rx", "ry", "rz", "table angle")
 TOLERANCE = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class TravelLimits:
     """Travel of each axis by itself: low and high (7,) of x, y, z (mm), the angles of R_x R_y R_z and the table (rad).
 

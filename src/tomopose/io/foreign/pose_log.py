@@ -22,6 +22,7 @@ from tomopose.io.poses_csv import pose_columns, poses_from_table
 from tomopose.io.table_text import TextTable, format_table
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.units import Array
+from tomopose.values import value
 
 Row = tuple[str, ...]
 SHOWN = 6
@@ -41,7 +42,7 @@ class PoseOptions:
     units: str | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class PoseLog:
     """Poses of a file, as words.
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tomopose.errors import InputError
+from tomopose.values import value
 
 GEOMETRY = ("d_SD_mm", "d_SR_mm", "p_u_mm", "p_v_mm", "n_u_px", "n_v_px")
 PIERCING = ("u_0_px", "v_0_px")
@@ -17,7 +17,7 @@ CHECK_TOLERANCE = 2e-3
 """Two statements of one length in a file agree if they differ by less than this, relative: three digits."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class ScannerDraft:
     """The scanner as a maker's file states it.
 
@@ -88,13 +88,13 @@ def sensible(values: Mapping[str, float | None], where: str) -> dict[str, float]
     pixels.
     """
     out = {}
-    for key, value in values.items():
-        if value is None:
+    for key, given in values.items():
+        if given is None:
             continue
         positive = key in GEOMETRY
-        if not math.isfinite(value) or (positive and value <= 0) or (key in COUNTS and value != int(value)):
-            raise InputError(f"{where}: {key} would be {value:g}; a positive number is needed")
-        out[key] = value
+        if not math.isfinite(given) or (positive and given <= 0) or (key in COUNTS and given != int(given)):
+            raise InputError(f"{where}: {key} would be {given:g}; a positive number is needed")
+        out[key] = given
     if "d_SD_mm" in out and "d_SR_mm" in out and out["d_SR_mm"] >= out["d_SD_mm"]:
         raise InputError(
             f"{where}: the object ({out['d_SR_mm']:g} mm from the source) lies behind the detector "

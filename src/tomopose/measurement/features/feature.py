@@ -19,13 +19,13 @@ A calotte is a sphere of which a part was seen; it differs by its kind alone.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from tomopose.errors import InputError
 from tomopose.units import Array, float_array
+from tomopose.values import value
 
 PARAMETERS = ("x_mm", "y_mm", "z_mm", "n_x", "n_y", "n_z", "radius_mm", "half_angle_rad")
 HAS_DIRECTION = ("plane", "line", "circle", "cylinder", "cone")
@@ -35,7 +35,7 @@ N_REPRESENTATIVE = 25
 D95_SHARE = 0.95
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@value
 class Feature:
     """A feature fitted to points.
 

@@ -5,19 +5,19 @@ An element is a connected part of the surface between sharp edges: a plane, a cy
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.units import Array, float_array
+from tomopose.values import value
 
 SHARP = np.radians(30.0)
 """Angle between neighbouring triangles from which their common edge is an edge of the part."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@value
 class Mesh:
     """points (n, 3) mm; faces (m, 3), counter-clockwise seen from outside."""
 

@@ -23,6 +23,7 @@ from tomopose.measurement.surface import edge_kernel as kernel
 from tomopose.measurement.surface.plateaus import shared_plateaus
 from tomopose.measurement.surface.splines import REACH, spline_coefficients
 from tomopose.units import Array, float_array
+from tomopose.values import value
 from tomopose.volume import Volume
 
 Method = Literal["esf", "local-50"]
@@ -86,7 +87,7 @@ class EdgeSettings:
             raise InputError(f"plateau_radius is {self.plateau_radius} voxels; 0 to 50 is possible")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@value
 class Edges:
     """Edges along lines.
 

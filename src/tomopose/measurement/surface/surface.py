@@ -11,7 +11,7 @@ half of that, a plane nothing.  The correction for it is off unless asked for, a
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -28,7 +28,7 @@ from tomopose.measurement.surface.splines import (
     smoothed_gradients,
 )
 from tomopose.units import Array, float_array
-from tomopose.values import require_types
+from tomopose.values import require_types, value
 from tomopose.volume import Volume
 
 SurfaceMethod = Literal["esf", "local-50", "iso-50"]
@@ -38,7 +38,7 @@ LAYERS = 128
 LEAST_AREA = 1e-3
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@value
 class Surface:
     """A measured surface in frame W.
 

@@ -18,15 +18,16 @@ from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.box import BOX_CORNERS
 from tomopose.geometry.frames import Frame
 from tomopose.units import Array
+from tomopose.values import value
 
 SPHERE, CYLINDER, CONE, BOX, TORUS, HALF_SPACE = range(6)
 UNION, INTERSECTION, DIFFERENCE = -1, -2, -3
 
 
 def _positive(what: str, **values: float) -> None:
-    for name, value in values.items():
-        if not (math.isfinite(value) and value > 0):
-            raise InputError(f"{what}: {name} is {value} mm; a positive length is needed")
+    for name, given in values.items():
+        if not (math.isfinite(given) and given > 0):
+            raise InputError(f"{what}: {name} is {given} mm; a positive length is needed")
 
 
 class Shape:
@@ -81,7 +82,7 @@ def rotation_to(axis: ArrayLike) -> Array:
     return np.array([[1 - x * x * k, -x * y * k, x], [-x * y * k, 1 - y * y * k, y], [-x, -y, z]])
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Primitive(Shape):
     """One primitive: kind, its lengths `p` (mm), half the sides of its box, and its place: x = R x_local + t."""
 

@@ -19,6 +19,7 @@ from tomopose.errors import EngineMissingError, InputError, ShapeError
 from tomopose.simulation.physics.attenuation import tabulated
 from tomopose.simulation.physics.materials import MATERIALS, Material, attenuation, table
 from tomopose.units import Array, float_array
+from tomopose.values import value
 
 MOST_STEPS = 1000
 CONDENSED_ERROR = 1e-5
@@ -34,7 +35,7 @@ class Tube:
     anode_angle_deg: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Spectrum:
     """energy (n,), keV; weight (n,), relative: photons, or what a detector makes of them.
 
@@ -111,7 +112,7 @@ def tube_spectrum(voltage: float, *, anode: str = "W", anode_angle_deg: float = 
     return Spectrum(energy=energy[keep], weight=weight[keep], tube=tube)
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Beam:
     """The condensed spectrum for given materials: T = sum_k w_k exp(-mu_k . L).
 

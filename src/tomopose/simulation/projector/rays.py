@@ -9,7 +9,6 @@ large ones: the error of a path stays below 1 nm even at grazing incidence.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -23,6 +22,7 @@ from tomopose.simulation.objects.shapes import Joined, Primitive, Shape, Solid
 from tomopose.simulation.projector.crossings import crossings
 from tomopose.simulation.projector.view import in_bands
 from tomopose.units import Array
+from tomopose.values import value
 
 BUNDLE = 32
 """Rays that are looked at together, to find which solids they can meet at all."""
@@ -47,7 +47,7 @@ class SolidArrays(NamedTuple):
     radius: Array
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Compiled:
     """Solids as flat arrays, each primitive in the frame of its solid.
 
