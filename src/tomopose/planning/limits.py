@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.trajectory.feasibility import TravelLimits, ball_in_view, collisions
 from tomopose.units import Array
+from tomopose.values import value
 
 
 def _paper_travel() -> TravelLimits:
@@ -20,7 +21,7 @@ def _paper_travel() -> TravelLimits:
     return TravelLimits.symmetric(x=10.0, y=10.0, z=10.0, rx=tilt, ry=tilt, rz=tilt)
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class PlanLimits:
     """travel:        of the manipulator's axes (default +-10 mm and +-5 degrees, the paper's).
     table_angles:  rad, the angles that the table may take; (0,) keeps it still.

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from tomopose.calibration.model.assumed import Assumed
 from tomopose.units import Array
+from tomopose.values import value
 
 NAMED, MOST_NAMED = 0.05, 3
 """Share of the variance from which an assumed value is named, and how many are."""
@@ -30,7 +31,7 @@ class ScanBudget:
     tilted: bool = True
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Halves:
     """How the calibrations from two disjoint halves of the poses differ over the field of view of a scan.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from typing import Any
 
@@ -19,6 +19,7 @@ from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PIVOT_TOLERANCE_MM, PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.units import Array
+from tomopose.values import value
 
 FEWEST_POSES = 5
 POSITION_UNITS = (("centimetres", "cm", 10.0), ("inches", "inch", 25.4), ("metres", "m", 1000.0))
@@ -36,7 +37,7 @@ def travel(R: Array, t: Array) -> tuple[float, float]:
     return float(np.abs(t - t[0]).max()), float(rotation_angle_between(R[0], R).max())
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Problem:
     """n observed centres with the poses they belong to, in the poses' order.
 

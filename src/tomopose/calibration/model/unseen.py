@@ -9,8 +9,6 @@ Control Systems 3 (1966) 293).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tomopose.calibration.model.assumed import (
@@ -24,6 +22,7 @@ from tomopose.calibration.model.ball_projection import ProjectionBlocks
 from tomopose.geometry.rotations import R_z, log_rotation, skew
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
+from tomopose.values import value
 
 HARMONICS = (1, 2)
 PLATFORM_RAD = 0.6
@@ -38,7 +37,7 @@ WOBBLES = (
 TRANSLATIONS = "scale_of_translations"
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Unseen:
     """names (c), sigma (c,): priors (1, mm, rad);  gain (m, c): K, how the estimate answers to each."""
 

@@ -7,7 +7,6 @@ A direction counts as unobservable where its predicted standard uncertainty exce
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from tomopose.calibration.model.parameters import MATTERS, FreeParameters, base_
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.rigid.fit import tangent_names
 from tomopose.units import Array
+from tomopose.values import value
 
 USELESS_MM, USELESS_RAD, USELESS_FACTOR = 10.0, 0.1, 20.0
 """Standard uncertainties beyond which t_HT and t, R_HT, and (times `MATTERS`) a scanner parameter count as unknown."""
@@ -30,7 +30,7 @@ SHOWN = 0.25
 """A direction's words name the coordinates with at least this part of its largest component."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Observability:
     """What the poses can determine.  singular_values of the scaled Jacobian, largest first; unobservable: directions,
     in words; notes: what would help."""
@@ -109,9 +109,9 @@ def unobservable_directions(J: Array, names: tuple[str, ...]) -> tuple[Array, li
     s, V = singular_values(J)
     bad = []
     limits = useless(names)
-    for value, v in zip(s, V, strict=True):
-        # v moved by one standard deviation changes the coordinates by v / value
-        if value <= SINGULAR * s[0] or (np.abs(v) / value > limits).any():
+    for s_k, v in zip(s, V, strict=True):
+        # v moved by one standard deviation changes the coordinates by v / s_k
+        if s_k <= SINGULAR * s[0] or (np.abs(v) / s_k > limits).any():
             bad.append(v)
     silent = [np.eye(len(names))[j] for j in np.flatnonzero(np.linalg.norm(J, axis=0) == 0)]
     return s, bad + silent

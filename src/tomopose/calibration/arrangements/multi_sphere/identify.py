@@ -23,6 +23,7 @@ from tomopose.geometry.projection import project
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
+from tomopose.values import value
 
 DEPTH_PART = 0.01
 """Standard uncertainty of a distance from the source by a ball's radius: blur and transmission shift a rim by some
@@ -49,7 +50,7 @@ class MeasuredBall(Protocol):
     def radius(self) -> float: ...
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Circles:
     """What was measured in one view: x_D (k, 2) px, covariance (k, 2, 2) px^2, radius (k,) px."""
 

@@ -23,6 +23,7 @@ from tomopose.errors import NotConvergedError
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
+from tomopose.values import value
 
 STEPS = 40
 STILL = 1e-4
@@ -33,7 +34,7 @@ WITHOUT_EFFECT = ("d_SR", "eta", "axis_y", "axis_tilt_x", "axis_tilt_y")
 """Scanner values that a free pose in every view takes up whole: they move no image."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class BallView:
     """One view: ball (k,) indices into the standard, x_D (k, 2) px, covariance (k, 2, 2) px^2."""
 
@@ -42,7 +43,7 @@ class BallView:
     covariance: Array
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class SharedValues:
     """What all views share: names of the scanner's values that are estimated, and the covariance (3m + q, 3m + q) of
     the standard's coordinates (mm) and of these."""
@@ -51,7 +52,7 @@ class SharedValues:
     covariance: Array
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class PathSolution:
     """scanner, centres (m, 3) mm in M: as estimated.  T_MW: n poses.  covariance: (n, 6, 6) of (w, t), rad and mm, of
     each view alone.  gain: (n, 6, 3m + q): how a pose follows what the views share.  residuals: px, per view (k, 2).

@@ -7,7 +7,6 @@ Multiple View Geometry, ch. 7), eq. (6) with one T_MT a view.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import permutations, product
 from typing import Any
 
@@ -22,14 +21,14 @@ from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
-from tomopose.values import require_types
+from tomopose.values import require_types, value
 
 STEPS, START_STEPS = 60, 12
 TOLERANCE = 1e-10
 LARGEST_CONDITION = 1e10
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class BallPose:
     """Pose of a ball object in one view: T_MW; covariance (6, 6) of (w, t), rad and mm, exp(w) from the left, along W;
     residuals (m, 2) px; chi2."""

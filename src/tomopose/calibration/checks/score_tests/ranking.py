@@ -31,6 +31,7 @@ from tomopose.calibration.checks.score_tests.score import (
 )
 from tomopose.calibration.model.problem import Problem
 from tomopose.units import Array
+from tomopose.values import value
 
 DECISIVE = 8.0
 """Evidence beyond which an effect is named: odds of 3000 to 1 after all looks.  A clean run reaches it once in some
@@ -46,7 +47,7 @@ TIE = 1e-6
 """Evidences that differ by less are equal: rounding alone would decide which is named first."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@value
 class Explanation:
     """An effect that explains what a fit leaves.
 
