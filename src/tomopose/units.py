@@ -6,12 +6,15 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from numpy.typing import ArrayLike
 
 Array = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.floating[Any]]
+"""float32 where images and volumes are held, else float64."""
 
 MICROMETRES_PER_MM = 1000.0
 MICRORADIANS_PER_RAD = 1.0e6

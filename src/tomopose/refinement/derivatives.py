@@ -30,7 +30,7 @@ from tomopose.engines.geometry import index_geometry
 from tomopose.engines.layout import F32, Rays
 from tomopose.engines.vector import W, derivative_block
 from tomopose.geometry.projection import ProjectionMatrices
-from tomopose.units import Array
+from tomopose.units import Floats
 from tomopose.volume import VoxelGrid
 
 MOTIONS = 6
@@ -170,7 +170,7 @@ def integrals_with_derivatives(
     *,
     threads: int = 2,
     vector: bool = True,
-) -> tuple[Array, Array]:
+) -> tuple[Floats, Floats]:
     """(m, n_v, n_u) line integrals and (m, 6, n_v, n_u) derivatives by the object's motion, float32, v contiguous.
 
     state: a volume as the CPU engine holds it.  The motion takes a point x of W to c + R(w)(x - c) + t, c the middle

@@ -13,7 +13,7 @@ from tomopose.refinement.derivatives import integrals_with_derivatives
 from tomopose.refinement.joint import Linear, normal_blocks
 from tomopose.refinement.measured import Measured
 from tomopose.refinement.motions import composed, gauge, transforms, without_gauge
-from tomopose.units import Array
+from tomopose.units import Array, Floats
 
 LEVEL_SIGMA = 0.01
 """Prior standard deviation of an image's level (ln of the open beam): a tube drifts by about one per cent in a scan."""
@@ -49,7 +49,7 @@ def matrices_of(data: Measured, q: Array) -> ProjectionMatrices:
     return ProjectionMatrices(P=P, n_u=m.n_u, n_v=m.n_v, p_u=m.p_u, p_v=m.p_v, pose_id=m.pose_id, in_front=m.in_front)
 
 
-def lines_of(engine: CpuEngine, state: np.ndarray, n: int) -> Array:
+def lines_of(engine: CpuEngine, state: np.ndarray, n: int) -> Floats:
     """Line integrals (n, N), pixels as [u, v]."""
     return np.asarray(engine.forward(state, range(n)).transpose(0, 2, 1)).reshape(n, -1)
 
@@ -109,7 +109,7 @@ class Fit:
         pull = precision @ unknown.ravel()
         dx, dq = linear.solve(r, pull, x, turns=2 * self.turns if first else self.turns)
 
-        def cost(volume: np.ndarray, values: Array, residual: Array) -> float:
+        def cost(volume: np.ndarray, values: Array, residual: Floats) -> float:
             own = float(values.ravel() @ precision @ values.ravel()) + ridge * float(np.vdot(volume, volume))
             return float(np.einsum("np,np,np->", w, residual, residual, dtype=np.float64)) + own
 
@@ -169,7 +169,7 @@ class Fit:
         return free & ((x > 0) | (uphill > 0))
 
 
-def robust_weights(r: Array, weight: Array, *, first: bool) -> tuple[Array, float]:
+def robust_weights(r: Floats, weight: Floats, *, first: bool) -> tuple[Floats, float]:
     """Weights (n, N) that fit the residual's own size, and that size over the noise (rms of the pixels in use).
 
     The residual holds what voxels, scatter and hardening leave besides noise: where it is larger than the noise, the

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.linalg
 
 from tomopose.engines.cpu import CpuEngine
-from tomopose.units import Array
+from tomopose.units import Array, Floats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,13 +32,13 @@ class Linear:
 
     engine: CpuEngine
     free: np.ndarray
-    J: Array
-    w: Array
+    J: Floats
+    w: Floats
     factor: tuple[Array, bool]
     ridge: float
 
     @classmethod
-    def of(cls, engine: CpuEngine, free: np.ndarray, J: Array, w: Array, precision: Array, ridge: float) -> Linear:
+    def of(cls, engine: CpuEngine, free: np.ndarray, J: Floats, w: Floats, precision: Array, ridge: float) -> Linear:
         """Factorise M = J'WJ + precision (n d, n d)."""
         d = J.shape[1]
         M = precision.copy()
@@ -46,33 +46,33 @@ class Linear:
             M[j * d : j * d + d, j * d : j * d + d] += block
         return cls(engine=engine, free=free, J=J, w=w, factor=scipy.linalg.cho_factor(M), ridge=ridge)
 
-    def project(self, x: np.ndarray) -> Array:
+    def project(self, x: np.ndarray) -> Floats:
         """A x, (n, N)."""
         n = len(self.w)
         lines = self.engine.forward(x, range(n)).transpose(0, 2, 1)
         return lines.reshape(n, -1)
 
-    def back(self, y: Array) -> np.ndarray:
+    def back(self, y: Floats) -> np.ndarray:
         """A' y over the free voxels."""
         n, m = len(self.w), self.engine.matrices
         images = y.reshape(n, m.n_u, m.n_v).transpose(0, 2, 1)
         return np.where(self.free, self.engine.transpose(images, range(n)), np.float32(0))
 
-    def poses(self, y: Array, pull: Array | float = 0.0) -> Array:
+    def poses(self, y: Floats, pull: Array | float = 0.0) -> Array:
         """M^-1 (J'W y - pull), (n, d)."""
         right = np.einsum("ndp,np->nd", self.J, self.w * y).ravel() - pull
         return np.asarray(scipy.linalg.cho_solve(self.factor, right)).reshape(len(self.w), -1)
 
-    def moved(self, q: Array) -> Array:
+    def moved(self, q: Array) -> Floats:
         """J q, (n, N), float32."""
         return np.asarray(np.einsum("ndp,nd->np", self.J, q.astype(np.float32)))
 
     def solve(
-        self, r: Array, pull: Array, x: np.ndarray, *, turns: int, tolerance: float = 1e-3
+        self, r: Floats, pull: Array, x: np.ndarray, *, turns: int, tolerance: float = 1e-3
     ) -> tuple[np.ndarray, Array]:
         """(dx, dq) for the residual r (n, N); pull: C^-1 q, flat; x: the volume, for the ridge."""
 
-        def reduced(y: Array) -> Array:
+        def reduced(y: Floats) -> Floats:
             """W (1 - J M^-1 J'W) y."""
             return self.w * (y - self.moved(self.poses(y)))
 
@@ -97,6 +97,6 @@ class Linear:
         return dx, self.poses(r - self.project(dx), pull)
 
 
-def normal_blocks(J: Array, w: Array) -> Array:
+def normal_blocks(J: Floats, w: Floats) -> Array:
     """J'WJ of each view, (n, d, d), float64."""
     return np.stack([(Jj * wj) @ Jj.T for Jj, wj in zip(J, w, strict=True)]).astype(np.float64)

@@ -7,12 +7,13 @@ import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 import scipy.ndimage
 import scipy.optimize
 
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.reconstruction.line_integrals import LineIntegrals
-from tomopose.units import Array
+from tomopose.units import Array, Floats
 from tomopose.volume import VoxelGrid
 
 BLOCK = 8
@@ -38,9 +39,9 @@ class Measured:
     judge: (n, N), the same for held-out pixels alone.  matrices, grid: binned to the same level.
     """
 
-    p: Array
-    weight: Array
-    judge: Array
+    p: Floats
+    weight: Floats
+    judge: Floats
     matrices: ProjectionMatrices
     grid: VoxelGrid
 
@@ -76,14 +77,14 @@ def measured(scan: LineIntegrals, grid: VoxelGrid, *, held_out: float, seed: int
     )
 
 
-def held_out_blocks(shape: tuple[int, int, int], share: float, seed: int) -> Array:
+def held_out_blocks(shape: tuple[int, int, int], share: float, seed: int) -> npt.NDArray[np.bool_]:
     """bool (n, n_u, n_v): whole blocks of pixels, drawn by chance, about `share` of all."""
     n, n_u, n_v = shape
     drawn = np.random.default_rng([seed, 20]).random((n, -(-n_u // BLOCK), -(-n_v // BLOCK))) < share
     return np.asarray(drawn.repeat(BLOCK, axis=1).repeat(BLOCK, axis=2)[:, :n_u, :n_v])
 
 
-def noise_variance(p: Array, good: Array) -> Array:
+def noise_variance(p: Floats, good: npt.NDArray[np.bool_]) -> Floats:
     """Variance of each pixel of (n, n_u, n_v), found from the images: a + b e^p, of counts and
     of what does not depend on them.
 
@@ -120,7 +121,7 @@ def binned(data: Measured, factor: int) -> Measured:
     m, n = data.matrices, len(data.p)
     small, shape = m.binned(factor), (n, m.n_u // factor, factor, m.n_v // factor, factor)
 
-    def blocks(flat: Array) -> Array:
+    def blocks(flat: Floats) -> Floats:
         images = flat.reshape(n, m.n_u, m.n_v)[:, : shape[1] * factor, : shape[3] * factor]
         return np.asarray(images.reshape(shape))
 

@@ -41,7 +41,7 @@ class Prior:
     @property
     def precision(self) -> Array:
         """C^-1 (6n, 6n)."""
-        return np.linalg.inv(self.covariance)
+        return np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
 
     def of_views(self, index: Array) -> Prior:
         """The prior of some of the views."""

@@ -52,7 +52,7 @@ def drawn_errors(
     r = data.p - images.transpose(0, 2, 1).reshape(n, -1) - state.offset[:, None].astype(np.float32)
     w, _ = robust_weights(r, data.weight, first=False)
     C, at = prior.covariance, (7 * np.arange(n)[:, None] + np.arange(6)).ravel()
-    own = np.linalg.inv(C)
+    own = np.asarray(np.linalg.inv(C), dtype=np.float64)
     precision = np.eye(7 * n) / LEVEL_SIGMA**2
     precision[np.ix_(at, at)] = own
     ridge = 1.0 / max(float(np.mean(state.volume[state.volume > 0] ** 2)), 1e-30)
