@@ -116,7 +116,8 @@ def assessed(
     open_ = () if found.faces else open_directions(information, prior, radius)
     verdict, reasons = decide(held_out, chi=state.chi, cut=found.faces, left=left, open_=open_)
     errors = drawn_errors(level, at, prior, samples=s.samples, turns=2 * s.turns, threads=threads, seed=s.seed)
-    spread = spread_of(errors, information, prior, points_jacobian(data, points_of(grid)))
+    K = points_jacobian(data, points_of(grid))
+    spread = spread_of(errors, information, prior, K, chi=state.chi)
     refined = replace(
         matrices,
         P=matrices.P @ transforms(state.q, np.asarray(grid.centre)),

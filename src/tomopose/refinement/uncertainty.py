@@ -73,20 +73,25 @@ def drawn_errors(
     return errors
 
 
-def spread_of(errors: Array, information: Array, prior: Prior, K: Array) -> Spread:
-    """Per view and point, from draws (s, n, 6), each view's information (n, 6, 6) and K (n, m, 2, 6), px per motion."""
+def spread_of(errors: Array, information: Array, prior: Prior, K: Array, *, chi: float) -> Spread:
+    """Per view and point, from draws (s, n, 6), each view's information (n, 6, 6) and K (n, m, 2, 6), px per motion.
+
+    chi: rms residual over noise of the fit.  Above 1 the voxels do not explain the images to their noise, and all is as
+    much larger (Birge ratio), up to the prior.
+    """
     n = len(information)
     blocks = np.stack([prior.covariance[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] for j in range(n)])
     known = np.linalg.inv(information + np.linalg.inv(blocks))
     drawn = np.einsum("nmic,snc->snmi", K, errors)
     with_volume_known = np.einsum("nmic,ncd,nmid->nmi", K, known, K)
     ratio = np.maximum((drawn**2).mean(axis=(0, 1)) / with_volume_known.mean(axis=0), 1.0)  # (m, 2)
-    variance = with_volume_known * ratio
+    excess = max(chi, 1.0) ** 2
+    variance = with_volume_known * ratio * excess
     of_motion = np.maximum((errors**2).mean(axis=(0, 1)) / np.einsum("ncc->c", known) * n, 1.0)
     prior_points = np.einsum("nmic,ncd,nmid->nmi", K, blocks, K)
     variance = np.minimum(variance, np.maximum(prior_points, with_volume_known))
     return Spread(
-        sigma=np.sqrt(np.minimum(np.einsum("ncc->nc", known) * of_motion, np.einsum("ncc->nc", blocks))),
+        sigma=np.sqrt(np.minimum(np.einsum("ncc->nc", known) * of_motion * excess, np.einsum("ncc->nc", blocks))),
         points_sigma=np.sqrt(variance.mean(axis=2)),
         widening=float(np.sqrt(ratio.mean())),
     )
