@@ -15,7 +15,7 @@ SIGNIFICANCE = 3.0
 
 MISFIT = 2.0
 """Residual over noise beyond which the model does not hold, where the residual is also larger than `MISFIT_SHARE`.
-On the scans of benchmarks/refine honest cases end at 1.0 to 1.4 (binned by 2: 1.7), an object cut by the view beyond 2."""
+On the scans of benchmarks/refine honest cases end at 1.0 to 1.4 (binned by 2: 1.7), a cut object beyond 2."""
 MISFIT_SHARE = 0.02
 """Rms residual over the rms line integral below which no misfit is large: finer than any voxel grid models an edge."""
 
