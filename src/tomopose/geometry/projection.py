@@ -120,6 +120,8 @@ def canonical(P: ArrayLike, in_front: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
         raise InputError(f"view {np.flatnonzero(norm == 0)[0]}: the third row of P is zero; not a cone-beam projection")
     depth = P[..., 2, :3] @ np.asarray(in_front, dtype=np.float64) + P[..., 2, 3]
     sign = np.where(depth < 0, -1.0, 1.0)
+    # a matrix that was scaled once keeps its bits, so that a selection of views equals those of the whole
+    norm = np.where(np.abs(norm - 1.0) <= 4 * np.finfo(np.float64).eps, 1.0, norm)
     result: Array = P * (sign / norm)[..., None, None]
     return result
 

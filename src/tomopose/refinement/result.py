@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,17 +12,14 @@ from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.provenance import Provenance
 from tomopose.refinement.judge import Verdict
 from tomopose.units import Array
-from tomopose.values import Column, require_types, table, value
+from tomopose.values import Column, Tabular, require_types, value
 from tomopose.volume import Volume
-
-if TYPE_CHECKING:
-    import pandas
 
 COLUMNS = ("t_x_mm", "t_y_mm", "t_z_mm", "w_x_deg", "w_y_deg", "w_z_deg")
 
 
 @value
-class Refinement:
+class Refinement(Tabular):
     """Each view's geometry, corrected from the scan's own images.
 
     matrices:     refined, in the input's order; the input's own where the verdict is not "refined".  `points_sigma` is
@@ -91,9 +87,9 @@ class Refinement:
         columns |= {f"sigma_{name}": self.sigma[:, k] * unit[k] for k, name in enumerate(COLUMNS)}
         return columns | {"residual_before": self.residual_before, "residual_after": self.residual_after}
 
-    def to_dataframe(self) -> pandas.DataFrame:
-        """`columns` as a pandas table, indexed by pose id.  EngineMissingError where pandas is not installed."""
-        return table(self.columns(), self.pose_id, "pose_id")
+    def row_names(self) -> tuple[str, ...]:
+        """The views' pose ids."""
+        return self.pose_id
 
 
 @require_types

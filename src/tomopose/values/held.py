@@ -178,7 +178,23 @@ def verdict_html(verdict: str, lines: Sequence[str], columns: Sequence[str], row
     )
 
 
-class Rows(ABC):
+class Tabular(ABC):
+    """What has a column of numbers for each of its views or poses."""
+
+    @abstractmethod
+    def columns(self) -> dict[str, Column]:
+        """Name (with its unit) -> one entry a row."""
+
+    @abstractmethod
+    def row_names(self) -> tuple[str, ...]:
+        """The rows' pose ids."""
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """`columns` as a pandas table, indexed by pose id.  EngineMissingError where pandas is not installed."""
+        return table(self.columns(), self.row_names(), "pose_id")
+
+
+class Rows(Tabular):
     """n rows with the names `pose_id`: what sequences of poses, observations and matrices have in common.
 
     A number, a pose id, a slice, a mask or a list of either selects rows; the result is of the same kind, also for one
@@ -191,9 +207,9 @@ class Rows(ABC):
     def select(self: R, index: object) -> R:
         """The rows with those indices (or that mask or slice), in that order."""
 
-    @abstractmethod
-    def columns(self) -> dict[str, Column]:
-        """Name (with its unit) -> one entry a row."""
+    def row_names(self) -> tuple[str, ...]:
+        """The rows' pose ids."""
+        return self.pose_id
 
     def __len__(self) -> int:
         return len(self.pose_id)
@@ -223,10 +239,6 @@ class Rows(ABC):
                 f"the table holds {held}"
             )
         return np.array([where[p] for p in pose_id], dtype=np.intp)
-
-    def to_dataframe(self) -> pandas.DataFrame:
-        """The rows as a pandas table, indexed by pose id.  EngineMissingError where pandas is not installed."""
-        return table(self.columns(), self.pose_id, "pose_id")
 
 
 def table(columns: Mapping[str, Column], index: Sequence[str], name: str) -> pandas.DataFrame:
