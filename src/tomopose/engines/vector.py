@@ -272,6 +272,62 @@ def _held(builder: ir.IRBuilder, place: ir.Value, end: ir.Value) -> ir.Value:
     return builder.select(builder.fcmp_ordered("<", place, end), place, end)
 
 
+Terms = Callable[..., tuple[ir.Value, ...]]
+"""(builder, voxels, count, start, row, at_a, at_b, k - centre) -> what is summed over the planes, W lanes each."""
+
+
+def _sums_of_rays(typed: tuple[types.Type, types.Type, types.Type], number: int, terms: Terms) -> Intrinsic:
+    """The walk of `forward_block` and `derivative_block`: `number` sums for each of W rays, one after the other.
+
+    typed: types of volume, rays and sums.
+    """
+    volume, rays, sums = typed
+    signature = types.void(
+        volume,
+        types.int64,
+        types.int64,
+        types.int32,
+        rays,
+        tuple_of(types.int64, 2),
+        tuple_of(types.float32, 3),
+        sums,
+    )
+
+    def generate(context: Context, builder: ir.IRBuilder, signature: Signature, arguments: Arguments) -> ir.Value:
+        volume, base, plane, row, rays, planes, ends, sums = arguments
+        voxels = _data(context, builder, signature.args[0], volume)
+        count = _count(context, builder, signature.args[0], volume)
+        table = _data(context, builder, signature.args[4], rays)
+        target = _data(context, builder, signature.args[7], sums)
+        k_0, k_1 = cgutils.unpack_tuple(builder, planes, 2)
+        centre, a_end, b_end = cgutils.unpack_tuple(builder, ends, 3)
+        a, da, b, db = (_load(builder, table, ir.Constant(I64, i * W)) for i in range(4))
+        a_end, b_end = _splat(builder, a_end), _splat(builder, b_end)
+        totals = [cgutils.alloca_once_value(builder, ir.Constant(VF, [0.0] * W)) for _ in range(number)]
+        with cgutils.for_range_slice(builder, k_0, k_1, ir.Constant(I64, 1), I64) as (k, _number):
+            step = _splat(builder, builder.fsub(builder.sitofp(k, F32), centre))
+            at_a = _held(builder, _call(builder, "fma", step, da, a), a_end)
+            at_b = _held(builder, _call(builder, "fma", step, db, b), b_end)
+            start = builder.add(base, builder.mul(k, plane))
+            for total, term in zip(totals, terms(builder, voxels, count, start, row, at_a, at_b, step), strict=True):
+                builder.store(builder.fadd(builder.load(total, typ=VF), term), total)
+        for i, total in enumerate(totals):
+            builder.store(builder.load(total, typ=VF), _at(builder, target, ir.Constant(I64, i * W), VF), align=4)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+def _value(builder: ir.IRBuilder, *place: ir.Value) -> tuple[ir.Value, ...]:
+    return (_bilinear(builder, *place[:-1]),)
+
+
+def _value_and_slopes(builder: ir.IRBuilder, *place: ir.Value) -> tuple[ir.Value, ...]:
+    value, slope_a, slope_b = _bilinear_with_slopes(builder, *place[:-1])
+    step = place[-1]
+    return value, slope_a, builder.fmul(step, slope_a), slope_b, builder.fmul(step, slope_b)
+
+
 @intrinsic
 def forward_block(
     typingctx: Context,
@@ -291,39 +347,7 @@ def forward_block(
     ends: (centre, a_end, b_end), float32.  Positions are held within [-1, a_end] and [-1, b_end], where the volume's
     margin is zero.
     """
-    signature = types.void(
-        volume,
-        types.int64,
-        types.int64,
-        types.int32,
-        rays,
-        tuple_of(types.int64, 2),
-        tuple_of(types.float32, 3),
-        sums,
-    )
-
-    def generate(context: Context, builder: ir.IRBuilder, signature: Signature, arguments: Arguments) -> ir.Value:
-        volume, base, plane, row, rays, planes, ends, sums = arguments
-        voxels = _data(context, builder, signature.args[0], volume)
-        count = _count(context, builder, signature.args[0], volume)
-        table = _data(context, builder, signature.args[4], rays)
-        target = _data(context, builder, signature.args[7], sums)
-        k_0, k_1 = cgutils.unpack_tuple(builder, planes, 2)
-        centre, a_end, b_end = cgutils.unpack_tuple(builder, ends, 3)
-        a, da, b, db = (_load(builder, table, ir.Constant(I64, i * W)) for i in range(4))
-        a_end, b_end = _splat(builder, a_end), _splat(builder, b_end)
-        total = cgutils.alloca_once_value(builder, ir.Constant(VF, [0.0] * W))
-        with cgutils.for_range_slice(builder, k_0, k_1, ir.Constant(I64, 1), I64) as (k, _number):
-            step = _splat(builder, builder.fsub(builder.sitofp(k, F32), centre))
-            at_a = _held(builder, _call(builder, "fma", step, da, a), a_end)
-            at_b = _held(builder, _call(builder, "fma", step, db, b), b_end)
-            start = builder.add(base, builder.mul(k, plane))
-            value = _bilinear(builder, voxels, count, start, row, at_a, at_b)
-            builder.store(builder.fadd(builder.load(total, typ=VF), value), total)
-        builder.store(builder.load(total, typ=VF), _at(builder, target, ir.Constant(I64, 0), VF), align=4)
-        return context.get_dummy_value()
-
-    return signature, generate
+    return _sums_of_rays((volume, rays, sums), 1, _value)
 
 
 @intrinsic
@@ -343,39 +367,4 @@ def derivative_block(
     sums (5 W,): of the volume f, df/da, (k - centre) df/da, df/db and (k - centre) df/db, over the planes
     k_0 <= k < k_1.
     """
-    signature = types.void(
-        volume,
-        types.int64,
-        types.int64,
-        types.int32,
-        rays,
-        tuple_of(types.int64, 2),
-        tuple_of(types.float32, 3),
-        sums,
-    )
-
-    def generate(context: Context, builder: ir.IRBuilder, signature: Signature, arguments: Arguments) -> ir.Value:
-        volume, base, plane, row, rays, planes, ends, sums = arguments
-        voxels = _data(context, builder, signature.args[0], volume)
-        count = _count(context, builder, signature.args[0], volume)
-        table = _data(context, builder, signature.args[4], rays)
-        target = _data(context, builder, signature.args[7], sums)
-        k_0, k_1 = cgutils.unpack_tuple(builder, planes, 2)
-        centre, a_end, b_end = cgutils.unpack_tuple(builder, ends, 3)
-        a, da, b, db = (_load(builder, table, ir.Constant(I64, i * W)) for i in range(4))
-        a_end, b_end = _splat(builder, a_end), _splat(builder, b_end)
-        totals = [cgutils.alloca_once_value(builder, ir.Constant(VF, [0.0] * W)) for _ in range(5)]
-        with cgutils.for_range_slice(builder, k_0, k_1, ir.Constant(I64, 1), I64) as (k, _number):
-            step = _splat(builder, builder.fsub(builder.sitofp(k, F32), centre))
-            at_a = _held(builder, _call(builder, "fma", step, da, a), a_end)
-            at_b = _held(builder, _call(builder, "fma", step, db, b), b_end)
-            start = builder.add(base, builder.mul(k, plane))
-            value, slope_a, slope_b = _bilinear_with_slopes(builder, voxels, count, start, row, at_a, at_b)
-            terms = (value, slope_a, builder.fmul(step, slope_a), slope_b, builder.fmul(step, slope_b))
-            for total, term in zip(totals, terms, strict=True):
-                builder.store(builder.fadd(builder.load(total, typ=VF), term), total)
-        for i, total in enumerate(totals):
-            builder.store(builder.load(total, typ=VF), _at(builder, target, ir.Constant(I64, i * W), VF), align=4)
-        return context.get_dummy_value()
-
-    return signature, generate
+    return _sums_of_rays((volume, rays, sums), 5, _value_and_slopes)
