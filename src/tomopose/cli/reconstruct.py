@@ -118,18 +118,24 @@ class ExecutionOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(CorrectedImages, AlgorithmOptions, ExecutionOptions, WritingOptions):
-    """The options of `tomopose reconstruct`."""
+class ScanAndGrid:
+    """A scan with its matrices, and the voxels that are wanted."""
 
     matrices: Annotated[Path, typer.Option("--matrices", help="matrices.npz of the scan.")]
     images: Annotated[str, typer.Option("--images", help="Folder, glob or multi-page file of the scan's images.")]
     voxel: Annotated[str, typer.Option("--voxel-mm", help="Side of a voxel, mm: one number, or X,Y,Z.")]
     size: Annotated[str, typer.Option("--size", help="Voxels along each axis, N or NX,NY,NZ.")]
-    out: Annotated[Path, typer.Option("--out", help="volume.h5 (also .nrrd, .mhd, .tif).")]
     centre: Annotated[str, typer.Option("--centre-mm", help="Middle of the volume in W, X,Y,Z.")] = "0,0,0"
     scanner: Annotated[
         Path | None, typer.Option("--scanner", help="scanner.json, for the row order and size of the image files.")
     ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(ScanAndGrid, CorrectedImages, AlgorithmOptions, ExecutionOptions, WritingOptions):
+    """The options of `tomopose reconstruct`."""
+
+    out: Annotated[Path, typer.Option("--out", help="volume.h5 (also .nrrd, .mhd, .tif).")]
     mask: Annotated[
         Path | None, typer.Option("--mask", help="Volume on the same grid that is not 0 where there may be material.")
     ] = None

@@ -10,7 +10,7 @@ import typer
 
 from tomopose.cli.common import NOT_TRUSTWORTHY, OK, arguments
 from tomopose.cli.options import WritingOptions, add_command
-from tomopose.cli.reconstruct import CorrectedImages, correction_from, grid_from
+from tomopose.cli.reconstruct import CorrectedImages, ScanAndGrid, correction_from, grid_from
 
 if TYPE_CHECKING:
     from tomopose import Provenance, Refinement
@@ -27,20 +27,13 @@ def register(app: typer.Typer) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(CorrectedImages, WritingOptions):
+class Options(ScanAndGrid, CorrectedImages, WritingOptions):
     """The options of `tomopose refine`."""
 
-    matrices: Annotated[Path, typer.Option("--matrices", help="matrices.npz of the scan, as calibrated.")]
-    images: Annotated[str, typer.Option("--images", help="Folder, glob or multi-page file of the scan's images.")]
-    voxel: Annotated[str, typer.Option("--voxel-mm", help="Side of a voxel, mm: one number, or X,Y,Z.")]
     size: Annotated[str, typer.Option("--size", help="Voxels along each axis, N or NX,NY,NZ: the whole object.")]
     out: Annotated[Path, typer.Option("--out", help="Folder for matrices.npz, refined.json and report.html.")]
-    centre: Annotated[str, typer.Option("--centre-mm", help="Middle of the volume in W, X,Y,Z.")] = "0,0,0"
     calibration: Annotated[
         Path | None, typer.Option("--calibration", help="calibration.json that the matrices were made from.")
-    ] = None
-    scanner: Annotated[
-        Path | None, typer.Option("--scanner", help="scanner.json, for the row order and size of the image files.")
     ] = None
     sigma: Annotated[
         float | None,
@@ -87,17 +80,15 @@ def refine(options: Options) -> int:
 
 
 def write(o: Options, result: Refinement, made: Provenance) -> None:
-    """The three files; `made` is the provenance block of all of them."""
+    """The three files, all or none; `made` is the provenance block of all of them."""
     from dataclasses import replace
 
     import tomopose as tp
+    from tomopose.files import atomic_folder
     from tomopose.report import write_report
     from tomopose.report.pages.refine_page import RefinedViews, refinement_report
 
     result = replace(result, provenance=made)
-    o.out.mkdir(parents=True, exist_ok=True)
-    tp.write_matrices(o.out / "matrices.npz", result.matrices, provenance=made, force=o.force)
-    tp.write_refinement(o.out / "refined.json", result, force=o.force)
     page = RefinedViews(
         columns=result.columns(),
         verdict=result.verdict,
@@ -108,7 +99,10 @@ def write(o: Options, result: Refinement, made: Provenance) -> None:
         after=result.volume,
         provenance=made,
     )
-    write_report(o.out / "report.html", refinement_report(page))
+    with atomic_folder(o.out, force=o.force) as folder:
+        tp.write_matrices(folder / "matrices.npz", result.matrices, provenance=made)
+        tp.write_refinement(folder / "refined.json", result)
+        write_report(folder / "report.html", refinement_report(page))
 
 
 def said(o: Options, result: Refinement) -> None:
