@@ -19,7 +19,7 @@ from tomopose.planning.part.keep_out import Obstacle
 from tomopose.planning.part.material_paths import material_paths
 from tomopose.planning.part.part import Part, require_simple
 from tomopose.planning.part.settings import PartSettings
-from tomopose.planning.part.worth import Goal, sources, table, worth
+from tomopose.planning.part.worth import Goal, table, worth
 from tomopose.planning.part_scan.choose import choose, dual_bound, value
 from tomopose.planning.part_scan.limits_file import ScanLimits, default_travel, read_limits
 from tomopose.planning.part_scan.plan import plan_part_scan
@@ -27,6 +27,7 @@ from tomopose.planning.part_scan.setting import Setting
 from tomopose.planning.part_scan.stations import allowed
 from tomopose.planning.part_scan.visit import travel, visiting_order
 from tomopose.reconstruction.choice import path_obstacle
+from tomopose.trajectory.completeness import source_path
 from tomopose.trajectory.feasibility import TravelLimits
 
 HALF = np.array([9.0, 7.0, 2.5])
@@ -196,7 +197,7 @@ def test_a_plan_is_worth_more_than_the_usual_paths_and_near_its_bound(small_scan
     P = tp.geometry.projection.eq5_matrices(
         small_scanner, T_HT=plan.machine.T_HT, T_MH=plan.poses.T_MH, alpha=plan.poses.alpha
     )
-    np.testing.assert_allclose(sources(P), plan.source_path, atol=1e-9)
+    np.testing.assert_allclose(source_path(P), plan.source_path, atol=1e-9)
     again = plan_part_scan(setting(small_scanner))
     np.testing.assert_array_equal(again.poses.alpha, plan.poses.alpha)
 

@@ -54,6 +54,63 @@ def lines_of(engine: CpuEngine, state: np.ndarray, n: int) -> Floats:
     return np.asarray(engine.forward(state, range(n)).transpose(0, 2, 1)).reshape(n, -1)
 
 
+def residual_of(data: Measured, lines: Floats, offset: Array) -> Floats:
+    """Measured minus projected line integrals (n, N), the images' levels taken off, float32."""
+    return data.p - lines - offset[:, None].astype(np.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Linearised:
+    """A level's data at a state.
+
+    engine: of its matrices;  x: its volume as the engine holds it;  J: (n, 7, N) derivatives by each view's motion and
+    level, (n, 1, N) with the motions held;  r: (n, N) residual.
+    """
+
+    engine: CpuEngine
+    x: np.ndarray
+    J: Floats
+    r: Floats
+
+    @property
+    def motions(self) -> Floats:
+        """(n, 6, N): derivatives by the motions alone."""
+        return self.J[:, :6]
+
+    def weighed(self, weight: Floats) -> Floats:
+        """The robust weights (n, N) of the residual."""
+        return robust_weights(self.r, weight, first=False)[0]
+
+
+def linearised(data: Measured, state: State, *, threads: int, held: bool = False) -> Linearised:
+    """The data's residual and derivatives at a state; held: by the images' levels alone."""
+    n, matrices = len(data.p), matrices_of(data, state.q)
+    engine = CpuEngine(matrices, data.grid, threads=threads)
+    x = engine.put(state.volume)
+    ones = np.ones((n, 1, data.p.shape[1]), dtype=np.float32)
+    if held:
+        lines, J = lines_of(engine, x, n), ones
+    else:
+        images, slopes = integrals_with_derivatives(x, matrices, data.grid, range(n), threads=threads)
+        lines = images.transpose(0, 2, 1).reshape(n, -1)
+        J = np.concatenate([slopes.transpose(0, 1, 3, 2).reshape(n, 6, -1), ones], axis=1)
+    return Linearised(engine=engine, x=x, J=J, r=residual_of(data, lines, state.offset))
+
+
+def ridge_of(volume: np.ndarray) -> float:
+    """lambda: the inverse mean square of the material's voxels."""
+    return 1.0 / max(float(np.mean(volume[volume > 0] ** 2)), 1e-30)
+
+
+def with_levels(precision: Array) -> Array:
+    """The precision (7n, 7n) of motions, (6n, 6n), and levels of all views."""
+    n = len(precision) // 6
+    whole = np.eye(7 * n) / LEVEL_SIGMA**2
+    at = (7 * np.arange(n)[:, None] + np.arange(6)).ravel()
+    whole[np.ix_(at, at)] = precision
+    return whole
+
+
 def blank(data: Measured) -> State:
     """Nothing known: an empty volume and no motion."""
     n = len(data.p)
@@ -89,23 +146,14 @@ class Fit:
         """One step with its line search, and the relative gain of the joint cost."""
         n, grid, threads = len(data.p), data.grid, self.threads
         first = not state.volume.any()
-        matrices = matrices_of(data, state.q)
-        engine = CpuEngine(matrices, grid, threads=threads)
-        x = engine.put(state.volume)
-        ones = np.ones((n, 1, data.p.shape[1]), dtype=np.float32)
-        if held:
-            lines, J = lines_of(engine, x, n), ones
-        else:
-            images, slopes = integrals_with_derivatives(x, matrices, grid, range(n), threads=threads)
-            lines = images.transpose(0, 2, 1).reshape(n, -1)
-            J = np.concatenate([slopes.transpose(0, 1, 3, 2).reshape(n, 6, -1), ones], axis=1)
-        r = data.p - lines - state.offset[:, None].astype(np.float32)
+        here = linearised(data, state, threads=threads, held=held)
+        engine, x, r = here.engine, here.x, here.r
         w, chi = robust_weights(r, data.weight, first=first)
         precision = self._precision(n, held=held)
         unknown = np.concatenate([state.q, state.offset[:, None]], axis=1)[:, 6 if held else 0 :]
         free = self._free(engine, x, w * r, first=first)
-        ridge = 0.0 if first else 1.0 / max(float(np.mean(state.volume[state.volume > 0] ** 2)), 1e-30)
-        linear = Linear.of(engine, free, J, w, precision, ridge)
+        ridge = 0.0 if first else ridge_of(state.volume)
+        linear = Linear.of(engine, free, here.J, w, precision, ridge)
         pull = precision @ unknown.ravel()
         dx, dq = linear.solve(r, pull, x, turns=2 * self.turns if first else self.turns)
 
@@ -113,19 +161,18 @@ class Fit:
             own = float(values.ravel() @ precision @ values.ravel()) + ridge * float(np.vdot(volume, volume))
             return float(np.einsum("np,np,np->", w, residual, residual, dtype=np.float64)) + own
 
+        information = None if held else normal_blocks(here.motions, w)
         before, part = cost(x, unknown, r), 1.0
         while part > SHORTEST_STEP:
             trial, values = self._tried(data, state, engine, x, (part, dx, dq), held=held)
             at = engine if held else CpuEngine(matrices_of(data, trial.q), grid, threads=threads)
-            residual = data.p - lines_of(at, values, n) - trial.offset[:, None].astype(np.float32)
+            residual = residual_of(data, lines_of(at, values, n), trial.offset)
             own = np.concatenate([trial.q, trial.offset[:, None]], axis=1)[:, 6 if held else 0 :]
             after = cost(values, own, residual)
             if after < before or first:
-                information = None if held else normal_blocks(J[:, :6], w)
-                state = replace(trial, chi=chi, information=information)
-                return state, (before - after) / max(before, 1e-30)
+                return replace(trial, chi=chi, information=information), (before - after) / max(before, 1e-30)
             part /= 2
-        return replace(state, chi=chi, information=None if held else normal_blocks(J[:, :6], w)), 0.0
+        return replace(state, chi=chi, information=information), 0.0
 
     def _tried(
         self,
@@ -153,10 +200,7 @@ class Fit:
         if held:
             return np.eye(n) / LEVEL_SIGMA**2
         assert self.precision is not None
-        whole = np.eye(7 * n) / LEVEL_SIGMA**2
-        at = (7 * np.arange(n)[:, None] + np.arange(6)).ravel()
-        whole[np.ix_(at, at)] = self.precision
-        return whole
+        return with_levels(self.precision)
 
     def _free(self, engine: CpuEngine, x: np.ndarray, pulled: Array, *, first: bool) -> np.ndarray:
         """Voxels that may move: inside the grid, and not held at zero by the bound."""

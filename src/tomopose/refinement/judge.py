@@ -8,10 +8,10 @@ from enum import Enum
 import numpy as np
 
 from tomopose.engines.cpu import CpuEngine
-from tomopose.refinement.fit import Fit, State, blank, lines_of, matrices_of
+from tomopose.refinement.fit import Fit, State, blank, lines_of, matrices_of, residual_of
 from tomopose.refinement.measured import Measured
 from tomopose.refinement.settings import MISFIT, MISFIT_SHARE, SIGNIFICANCE
-from tomopose.units import Array
+from tomopose.units import Array, Floats
 
 
 class Verdict(Enum):
@@ -77,11 +77,11 @@ def trial(data: Measured, refined: State, fit: Fit) -> tuple[Trial, State, State
     )
 
 
-def residual(data: Measured, state: State, *, threads: int) -> Array:
+def residual(data: Measured, state: State, *, threads: int) -> Floats:
     """Measured minus projected line integrals (n, N)."""
     engine = CpuEngine(matrices_of(data, state.q), data.grid, threads=threads)
     lines = lines_of(engine, engine.put(state.volume), len(data.p))
-    return np.asarray(data.p - lines - state.offset[:, None].astype(np.float32))
+    return residual_of(data, lines, state.offset)
 
 
 def decide(

@@ -4,13 +4,14 @@ meet what lies beyond the grid."""
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import scipy.ndimage
 import scipy.optimize
 
+from tomopose.coverage import MAD_TO_SIGMA
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.reconstruction.line_integrals import LineIntegrals
 from tomopose.units import Array, Floats
@@ -21,8 +22,6 @@ BLOCK = 8
 LEAST_NOISE = 2e-4
 """Standard deviation of a pixel, relative to the largest line integral, that no image falls below: what a projector of
 voxels leaves of an exact line integral's rounding."""
-NORMAL_MEDIAN = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
 
 MATTER = 0.15
 """Share of the volume's dense values (99.9 %) from which a voxel of the outermost layers counts as matter."""
@@ -44,16 +43,6 @@ class Measured:
     judge: Floats
     matrices: ProjectionMatrices
     grid: VoxelGrid
-
-    def of_views(self, index: Array) -> Measured:
-        """Some of the views."""
-        return replace(
-            self,
-            p=self.p[index],
-            weight=self.weight[index],
-            judge=self.judge[index],
-            matrices=self.matrices.select(index),
-        )
 
 
 def measured(scan: LineIntegrals, grid: VoxelGrid, *, held_out: float, seed: int) -> Measured:
@@ -105,7 +94,7 @@ def noise_variance(p: Floats, good: npt.NDArray[np.bool_]) -> Floats:
         inside = d[(at >= low) & (at <= high)]
         if inside.size >= 50:
             centre.append(0.5 * (low + high))
-            found.append((NORMAL_MEDIAN * np.median(np.abs(inside - np.median(inside)))) ** 2 / 1.5)
+            found.append((MAD_TO_SIGMA * np.median(np.abs(inside - np.median(inside)))) ** 2 / 1.5)
     if not found:
         return np.full(p.shape, max(floor, float(np.var(d)) / 1.5 if d.size else floor), dtype=np.float32)
     level = np.maximum(found, floor)

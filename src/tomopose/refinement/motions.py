@@ -10,6 +10,7 @@ import numpy as np
 
 from tomopose.calibration.uncertainty.trajectory import point_jacobian
 from tomopose.geometry.rotations import exp_rotation, log_rotation, skew
+from tomopose.trajectory.completeness import source_path
 from tomopose.units import Array
 
 
@@ -40,8 +41,7 @@ def gauge(P: Array, centre: Array) -> Array:
     n = len(P)
     G = np.zeros((n, 6, 7))
     G[:, :, :6] = np.eye(6)
-    source = -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[..., 0]
-    G[:, :3, 6] = centre - source
+    G[:, :3, 6] = centre - source_path(P)
     return G
 
 

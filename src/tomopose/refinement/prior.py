@@ -43,10 +43,17 @@ class Prior:
         """C^-1 (6n, 6n)."""
         return np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
 
-    def of_views(self, index: Array) -> Prior:
-        """The prior of some of the views."""
-        at = (6 * np.asarray(index)[:, None] + np.arange(6)).ravel()
-        return replace(self, parts=tuple(K[np.ix_(at, at)] for K in self.parts))
+    @property
+    def blocks(self) -> Array:
+        """C of each view alone (n, 6, 6)."""
+        C = self.covariance
+        n = len(C) // 6
+        return np.asarray(C.reshape(n, 6, n, 6)[np.arange(n), :, np.arange(n)])
+
+    @property
+    def stated(self) -> Prior:
+        """The prior at the sizes that were stated."""
+        return replace(self, sizes=np.ones(len(self.sizes)))
 
     def by_evidence(self, q: Array, information: Array, *, turns: int = 20) -> Prior:
         """The sizes that explain motions q (n, 6) best, given the images' information N (6n, 6n) about them."""
@@ -82,8 +89,3 @@ def scatter(sigma_mm: Array, sigma_rad: Array) -> Prior:
         variance[:, column] = np.asarray(sigma)[:, None] ** 2
         parts.append(np.diag(variance.ravel()))
     return Prior(names=("shift from view to view", "turn from view to view"), parts=tuple(parts), sizes=np.ones(2))
-
-
-def with_part(prior: Prior, name: str, K: Array) -> Prior:
-    """The prior with one part more."""
-    return Prior(names=(*prior.names, name), parts=(*prior.parts, K), sizes=np.append(prior.sizes, 1.0))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import scipy.linalg
 
 from tomopose.calibration.result import Calibration
+from tomopose.coverage import MAD_TO_SIGMA
 from tomopose.engines.cpu import processors
 from tomopose.engines.geometry import require_usable
 from tomopose.errors import InputError
@@ -17,7 +17,8 @@ from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.provenance import provenance
 from tomopose.reconstruction.line_integrals import Correction, ImagesAre, require_contrast
 from tomopose.reconstruction.run import line_integrals_of
-from tomopose.refinement.fit import Fit, State, blank
+from tomopose.refinement.fit import Fit, State, blank, linearised
+from tomopose.refinement.joint import normal_blocks
 from tomopose.refinement.judge import Verdict, decide, trial
 from tomopose.refinement.measured import Measured, binned, crossed_faces, finer, measured, rays_through
 from tomopose.refinement.motions import pixel_jacobian, transforms
@@ -27,13 +28,12 @@ from tomopose.refinement.settings import DEFAULT_SIGMA_PX, LEAST_PIXELS, MOST_SA
 from tomopose.refinement.uncertainty import (
     VOLUME_UNKNOWN,
     drawn_errors,
-    information_blocks,
     open_directions,
     points_jacobian,
     spread_of,
 )
 from tomopose.units import Array
-from tomopose.values import require_types
+from tomopose.values import Images, require_types
 from tomopose.volume import Volume, VoxelGrid
 
 FEWEST_VIEWS = 8
@@ -48,7 +48,7 @@ Progress = Callable[[int, int], None] | None
 
 @require_types
 def refine(
-    images: Sequence[npt.NDArray[np.generic]],
+    images: Images,
     matrices: ProjectionMatrices,
     grid: VoxelGrid,
     calibration: Calibration | None = None,
@@ -110,12 +110,13 @@ def assessed(
     held_out, before, after = trial(level, state, fit)
     steps.done()
     at = replace(after, q=state.q)
-    information = information_blocks(level, at, threads=threads)
+    here = linearised(level, at, threads=threads)
+    information = normal_blocks(here.motions, here.weighed(level.weight))
     radius = radius_of(grid)
     left = float((level.weight > 0).mean()) / (1 - s.held_out) if found.faces else 1.0
     open_ = () if found.faces else open_directions(information, prior, radius)
     verdict, reasons = decide(held_out, chi=state.chi, cut=found.faces, left=left, open_=open_)
-    errors = drawn_errors(level, at, prior, samples=s.samples, turns=2 * s.turns, threads=threads, seed=s.seed)
+    errors = drawn_errors(level, at, here, prior, samples=s.samples, turns=2 * s.turns, seed=s.seed)
     K = points_jacobian(data, points_of(grid))
     spread = spread_of(errors, information, prior, K, chi=state.chi)
     refined = replace(
@@ -263,6 +264,6 @@ def jumps(q: Array, sigma: Array, radius: float) -> tuple[int, ...]:
     lever = np.array([1.0] * 3 + [radius] * 3)
     size = np.linalg.norm(q * lever, axis=1)
     middle = float(np.median(size))
-    wide = 1.4826 * float(np.median(np.abs(size - middle)))
+    wide = MAD_TO_SIGMA * float(np.median(np.abs(size - middle)))
     own = np.linalg.norm(sigma * lever, axis=1)
     return tuple(int(j) for j in np.flatnonzero((size > middle + 6 * wide) & (size > 4 * own)))

@@ -12,10 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tomopose.engines.cpu import CpuEngine
-from tomopose.refinement.derivatives import integrals_with_derivatives
-from tomopose.refinement.fit import LEVEL_SIGMA, State, matrices_of, robust_weights
-from tomopose.refinement.joint import Linear, normal_blocks
+from tomopose.refinement.fit import LEVEL_SIGMA, Linearised, State, ridge_of, with_levels
+from tomopose.refinement.joint import Linear
 from tomopose.refinement.measured import Measured
 from tomopose.refinement.motions import gauge, pixel_jacobian, without_gauge
 from tomopose.refinement.prior import Prior
@@ -39,29 +37,16 @@ class Spread:
 
 
 def drawn_errors(
-    data: Measured, state: State, prior: Prior, *, samples: int, turns: int, threads: int, seed: int
+    data: Measured, state: State, here: Linearised, prior: Prior, *, samples: int, turns: int, seed: int
 ) -> Array:
-    """Errors (samples, n, 6) of the motions that noise and prior of their own size make."""
-    n = len(data.p)
-    matrices = matrices_of(data, state.q)
-    engine = CpuEngine(matrices, data.grid, threads=threads)
-    x = engine.put(state.volume)
-    images, slopes = integrals_with_derivatives(x, matrices, data.grid, range(n), threads=threads)
-    ones = np.ones((n, 1, data.p.shape[1]), dtype=np.float32)
-    J = np.concatenate([slopes.transpose(0, 1, 3, 2).reshape(n, 6, -1), ones], axis=1)
-    r = data.p - images.transpose(0, 2, 1).reshape(n, -1) - state.offset[:, None].astype(np.float32)
-    w, _ = robust_weights(r, data.weight, first=False)
-    C, at = prior.covariance, (7 * np.arange(n)[:, None] + np.arange(6)).ravel()
-    own = np.asarray(np.linalg.inv(C), dtype=np.float64)
-    precision = np.eye(7 * n) / LEVEL_SIGMA**2
-    precision[np.ix_(at, at)] = own
-    ridge = 1.0 / max(float(np.mean(state.volume[state.volume > 0] ** 2)), 1e-30)
-    linear = Linear.of(engine, x > 0, J, w, precision, ridge)
+    """Errors (samples, n, 6) of the motions that noise and prior of their own size make.  here: the data at `state`."""
+    n, x, w = len(data.p), here.x, here.weighed(data.weight)
+    C, own = prior.covariance, prior.precision
+    precision = with_levels(own)
+    linear = Linear.of(here.engine, x > 0, here.J, w, precision, ridge_of(state.volume))
     rng, root = np.random.default_rng([seed, 21]), np.linalg.cholesky(C + 1e-15 * np.trace(C) * np.eye(len(C)))
-    G, sigma = (
-        gauge(data.matrices.P, np.asarray(data.grid.centre)),
-        np.where(w > 0, 1 / np.sqrt(np.maximum(w, 1e-30)), 0),
-    )
+    G = gauge(data.matrices.P, np.asarray(data.grid.centre))
+    sigma = np.where(w > 0, 1 / np.sqrt(np.maximum(w, 1e-30)), 0)
     errors = np.empty((samples, n, 6))
     for k in range(samples):
         truth = np.zeros((n, 7))
@@ -80,7 +65,7 @@ def spread_of(errors: Array, information: Array, prior: Prior, K: Array, *, chi:
     much larger (Birge ratio), up to the prior.
     """
     n = len(information)
-    blocks = np.stack([prior.covariance[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] for j in range(n)])
+    blocks = prior.blocks
     known = np.linalg.inv(information + np.linalg.inv(blocks))
     drawn = np.einsum("nmic,snc->snmi", K, errors)
     with_volume_known = np.einsum("nmic,ncd,nmid->nmi", K, known, K)
@@ -103,10 +88,7 @@ def open_directions(information: Array, prior: Prior, radius: float) -> tuple[st
     information: (n, 6, 6) of the views with the volume held.  A direction is open where the images, the volume unknown,
     leave more than `UNDETERMINED` of the prior that was stated.  radius: mm, of the object, in the words.
     """
-    n = len(information)
-    stated = Prior(names=prior.names, parts=prior.parts, sizes=np.ones(len(prior.sizes))).covariance
-    blocks = np.stack([stated[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] for j in range(n)])
-    root = np.linalg.cholesky(blocks.mean(axis=0))
+    root = np.linalg.cholesky(prior.stated.blocks.mean(axis=0))
     F = root.T @ (information.mean(axis=0) / VOLUME_UNKNOWN) @ root
     values, vectors = np.linalg.eigh(F)
     left = 1 / np.sqrt(1 + np.maximum(values, 0))
@@ -129,18 +111,6 @@ def direction_in_words(motion: Array, radius: float) -> str:
     k = int(np.abs(axis).argmax())
     where = AXES[k] if abs(axis[k]) > 0.95 else "(" + ", ".join(f"{a:.2f}" for a in axis * np.sign(axis[k])) + ")"
     return f"A turn of the object about {where}" if turning else f"Motion of the object along {where}"
-
-
-def information_blocks(data: Measured, state: State, *, threads: int) -> Array:
-    """J'WJ (n, 6, 6) of each view at a state, the volume held, weights scaled to the residual."""
-    n = len(data.p)
-    matrices = matrices_of(data, state.q)
-    x = CpuEngine(matrices, data.grid, threads=threads).put(state.volume)
-    images, slopes = integrals_with_derivatives(x, matrices, data.grid, range(n), threads=threads)
-    r = data.p - images.transpose(0, 2, 1).reshape(n, -1) - state.offset[:, None].astype(np.float32)
-    w, _ = robust_weights(r, data.weight, first=False)
-    J = slopes.transpose(0, 1, 3, 2).reshape(n, 6, -1)
-    return normal_blocks(J, w)
 
 
 def points_jacobian(data: Measured, points: Array) -> Array:

@@ -25,7 +25,8 @@ import numpy as np
 from tomopose.geometry.scanner import Scanner
 from tomopose.measurement.plan import MeasurandPlan
 from tomopose.planning.part.targets import Target
-from tomopose.planning.part.worth import Goal, Views, sources
+from tomopose.planning.part.worth import Goal, Views
+from tomopose.trajectory.completeness import source_path
 from tomopose.units import Array
 
 SINGULAR = 1e-12
@@ -139,7 +140,7 @@ def why_unseen(goal: Goal, P: Array, views: Views, target: Target) -> str:
             f"{s.least_transmission:g} is needed): a higher voltage, or another placing of the part"
         )
     k = int(hidden[int(least.argmax())])
-    d = target.x[k] - sources(P)[int(views.incidence[:, rows][:, k].argmin())]
+    d = target.x[k] - source_path(P)[int(views.incidence[:, rows][:, k].argmin())]
     d /= np.linalg.norm(d)
     turn = np.cross(d, target.n[k])
     turn /= max(float(np.linalg.norm(turn)), 1e-12)

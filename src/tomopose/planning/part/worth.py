@@ -20,6 +20,7 @@ from tomopose.planning.part.material_paths import material_paths
 from tomopose.planning.part.part import Part
 from tomopose.planning.part.settings import LIFT_MM, WEIGHTS, PartSettings
 from tomopose.planning.part.targets import Target
+from tomopose.trajectory.completeness import source_path
 from tomopose.units import Array
 
 
@@ -99,14 +100,9 @@ class Worth:
     seen: dict[str, float]
 
 
-def sources(P: Array) -> Array:
-    """(n, 3) where the source is in coordinates of the part, mm."""
-    return np.asarray(-np.linalg.solve(P[:, :, :3], P[:, :, 3:])[..., 0], dtype=np.float64)
-
-
 def table(goal: Goal, P: Array) -> Views:
     """The tables of views with matrices P (n, 3, 4), points of the part at home to pixels."""
-    s, settings = sources(P), goal.settings
+    s, settings = source_path(P), goal.settings
     x, n, k = goal.x, goal.n, len(goal.x_tuy)
     lifted = np.concatenate([x + LIFT_MM * n, goal.x_tuy])
     L, _ = material_paths(P, goal.part.mesh.points, goal.part.mesh.faces, lifted)
@@ -144,7 +140,7 @@ def worth(goal: Goal, P: Array, views: Views | None = None) -> Worth:
     by_point = best[m:].reshape(len(goal.x_tuy), -1)
     C, T, M = float(np.mean(list(shares.values()))), float(by_point.mean()), float(v.M.mean())
     nearest = np.full((len(goal.x_tuy), len(goal.planes)), np.inf)
-    s = sources(P)
+    s = source_path(P)
     for j in range(0, len(s), 256):
         nearest = np.minimum(nearest, _beta(goal, s[j : j + 256]).min(axis=0))
     worst = goal.x_tuy[int(by_point.mean(axis=1).argmin())]

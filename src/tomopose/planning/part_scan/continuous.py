@@ -13,10 +13,11 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from tomopose.errors import OutOfReachError
-from tomopose.planning.part.worth import Views, sources
+from tomopose.planning.part.worth import Views
 from tomopose.planning.part_scan.choose import value, without_each
 from tomopose.planning.part_scan.setting import Setting
 from tomopose.planning.part_scan.stations import FULL_TURN, Machine
+from tomopose.trajectory.completeness import source_path
 from tomopose.units import Array
 
 STEEPEST = 1.0
@@ -70,7 +71,7 @@ def smooth_turn(setting: Setting, q: Array, P: Array, tables: Views, m: Array, w
             "allowed; widen the limits, or plan without --continuous",
             limits=setting.limits,
         )
-    ray = sources(P) - setting.part.centre
+    ray = source_path(P) - setting.part.centre
     turn = _Turn(
         slots=[np.flatnonzero(slot == k) for k in range(len(angles))],
         height=np.arcsin(ray[:, 2] / np.linalg.norm(ray, axis=1)),

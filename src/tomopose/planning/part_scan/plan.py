@@ -13,7 +13,7 @@ from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.planning.part.predict import Predicted, measurand_u, predicted, shared_part, why_unseen
 from tomopose.planning.part.settings import WEIGHTS, PartSettings
-from tomopose.planning.part.worth import Goal, Views, Worth, sources, table, worth
+from tomopose.planning.part.worth import Goal, Views, Worth, table, worth
 from tomopose.planning.part_scan.choose import choose, dual_bound, value
 from tomopose.planning.part_scan.continuous import fine_path, of_one_turn, smooth_turn
 from tomopose.planning.part_scan.limits_file import ScanLimits
@@ -22,6 +22,7 @@ from tomopose.planning.part_scan.paths import usual_paths
 from tomopose.planning.part_scan.setting import Setting
 from tomopose.planning.part_scan.stations import Machine, allowed
 from tomopose.planning.part_scan.visit import duration, travel, turn_duration, visiting_order
+from tomopose.trajectory.completeness import source_path
 from tomopose.units import Array
 
 Progress = Callable[[str], None]
@@ -92,7 +93,7 @@ class PartScanPlan:
     @property
     def source_path(self) -> Array:
         """(n, 3) where the source is in the part's coordinates, mm, in the order of the views."""
-        return sources(self.machine.matrices(self.chosen.q))
+        return source_path(self.machine.matrices(self.chosen.q))
 
 
 def _silent(_: str) -> None:
