@@ -36,6 +36,7 @@ def imports(path: Path) -> set[str]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", ROOMS)
 def test_foreign_packages_stay_in_their_rooms(package):
     strays = [
@@ -46,6 +47,7 @@ def test_foreign_packages_stay_in_their_rooms(package):
     assert strays == []
 
 
+@pytest.mark.slow
 def test_the_library_neither_prints_nor_exits():
     strays = []
     for path in SOURCE.rglob("*.py"):

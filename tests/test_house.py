@@ -77,16 +77,19 @@ def test_a_folder_is_a_room_not_a_hall():
     assert {f: n for f, n in files.items() if n > MOST_FILES and f not in ONE_FILE_A_THING} == {}
 
 
+@pytest.mark.slow
 def test_a_function_is_read_on_one_screen():
     long = {name: f.end_lineno - f.lineno + 1 for name, f in functions() if f.end_lineno - f.lineno >= MOST_LINES}
     assert long == {}
 
 
+@pytest.mark.slow
 def test_a_function_takes_few_arguments():
     counts = {name: (len(parameters(f)), COMPILED if is_compiled(f) else MOST_PARAMETERS) for name, f in functions()}
     assert {name: n for name, (n, most) in counts.items() if n > most} == {}
 
 
+@pytest.mark.slow
 def test_blocks_nest_four_deep_at_most():
     deep = {name: depth(f) for name, f in functions() if depth(f) > DEEPEST}
     assert deep == {}
@@ -121,6 +124,7 @@ def imported(path: Path, known: set[str]) -> set[str]:
     return found - {module_name(path)}
 
 
+@pytest.mark.slow
 def test_no_files_import_one_another_in_a_circle():
     names = {module_name(p): p for p in FILES}
     graph = {name: imported(path, set(names)) for name, path in names.items()}

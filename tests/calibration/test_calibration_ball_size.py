@@ -45,6 +45,7 @@ def gauge(calibration):
     return [f for f in calibration.checks if f.rule.startswith("size of the ball")]
 
 
+@pytest.mark.slow
 def test_size_is_that_of_the_shadow_of_the_balls_own_surface(run):
     poses, observed = run
     calibration = calibrate(SCANNER, poses, observed.with_ball_diameter(DIAMETER))
@@ -60,6 +61,7 @@ def test_outlines_under_a_matrix_are_the_areas_of_the_balls_own_shadow():
     np.testing.assert_allclose(np.pi * silhouette_outlines(P, x_S, DIAMETER), area, rtol=3e-4)
 
 
+@pytest.mark.slow
 def test_wrong_scale_of_the_translations_that_centres_hide_is_named():
     poses = paper_poses(2)
     observed = with_sizes(poses, observe(poses), 0.0)
@@ -99,6 +101,7 @@ def test_without_sizes_or_diameter_nothing_is_said(run):
 UNITS = [("centimetres (cm)", 10.0), ("inches (inch)", 25.4), ("metres (m)", 1000.0)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("words", "factor"), UNITS)
 def test_positions_in_another_unit_are_refused_by_name_on_every_route(words, factor):
     """The table does not move, so that the centres fit as well; several balls, several runs and a moving scanner

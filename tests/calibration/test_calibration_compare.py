@@ -32,6 +32,7 @@ def run(seed, **columns):
     return calibrate(SCANNER, POSES, observe(POSES, seed=seed, **columns), hypotheses=False)
 
 
+@pytest.mark.slow
 def test_repetitions_do_not_differ_and_p_is_uniform():
     p = [compare(run(2 * k), run(2 * k + 1)).p_mount for k in range(40)]
     assert np.mean(np.array(p) < 0.05) < 0.2
@@ -100,6 +101,7 @@ def test_a_single_bumped_run_is_flagged_among_few_and_many(n, bump, u):
         assert control_chart([entry(x, u) for x in value], "d_rms_px").out[place]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "alarms"), [(6, 0.02), (20, 0.008)])
 def test_quiet_runs_stay_inside(n, alarms):
     rng = np.random.default_rng(0)
@@ -114,6 +116,7 @@ def test_quiet_runs_stay_inside(n, alarms):
 FIELD = PoseField(translation=0.002, rotation=0.0, field_translation=0.01, field_rotation=0.0, length=8.0)
 
 
+@pytest.mark.slow
 def test_shared_pose_errors_are_estimated_and_covered():
     """Drawn from their own model: the field's size is found, and the widened covariance holds the truth."""
     poses = mixed_poses(n=36)

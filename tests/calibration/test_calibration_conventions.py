@@ -33,6 +33,7 @@ def ran(study, folder, name, *, still=False):
     return code, said, code_c, calibrated
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["rows flipped", "order ZYX", "y and z exchanged", "pairing lag +3", "half a pixel low"]
 )
@@ -47,6 +48,7 @@ def test_the_true_cause_is_named_and_the_calibration_refused(study, tmp_path, na
     assert calibrated["verdict"] in ("rejected", "doubtful")
 
 
+@pytest.mark.slow
 def test_half_a_pixel_is_named_and_refused_whether_the_scanner_is_exact_or_not(study, tmp_path):
     """Where nobody vouches for u_0 and v_0 the shift may be theirs: both readings are named."""
     code, said, code_c, calibrated = ran(study, tmp_path, "half a pixel low")
@@ -63,6 +65,7 @@ def test_half_a_pixel_is_named_and_refused_whether_the_scanner_is_exact_or_not(s
     assert calibrated["verdict"] in ("rejected", "doubtful")
 
 
+@pytest.mark.slow
 def test_what_cannot_be_distinguished_is_said(study, tmp_path):
     code, said, code_c, _ = ran(study, tmp_path, "order ZYX", still=True)
     assert code == code_c == 0
@@ -71,6 +74,7 @@ def test_what_cannot_be_distinguished_is_said(study, tmp_path):
     assert "order ZYX" in told
 
 
+@pytest.mark.slow
 def test_an_order_that_the_poses_do_not_show_is_doubted_until_the_user_confirms_it(study, tmp_path):
     rng = np.random.default_rng(0)
     options = study.write(tmp_path, study.MISTAKES["order ZYX"](study.files(rng, still=True), rng))
@@ -88,6 +92,7 @@ def test_an_order_that_the_poses_do_not_show_is_doubted_until_the_user_confirms_
     assert study.command(["calibrate", *options, "--out", str(tmp_path / "written")])[0] == 0
 
 
+@pytest.mark.slow
 def test_readings_that_fit_equally_well_are_named_together(study, tmp_path):
     """With the table still and the ball turned by single axes, transposed rotations are angles of the other sign."""
     code, said, _, _ = ran(study, tmp_path, "rotation inverted", still=True)

@@ -44,6 +44,7 @@ def region_share(errors, C):
     return np.mean(q < chdtri(C.shape[0], 0.05))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("poses", "priors", "noise"),
     [
@@ -71,6 +72,7 @@ def test_parameters(poses, priors, noise):
     np.testing.assert_allclose(interval[:, 1] - interval[:, 0], 3.92 * np.sqrt(np.diag(C)), rtol=0.15)
 
 
+@pytest.mark.slow
 def test_pixels_and_lengths():
     poses = paper_poses(2)
     cal = calibrate(SCANNER, poses, observe(poses), hypotheses=False)
@@ -106,6 +108,7 @@ def test_pixels_and_lengths():
     np.testing.assert_allclose(np.std(points, axis=0), object_sigma(cal, scan, x), rtol=0.1)
 
 
+@pytest.mark.slow
 def test_widening_keeps_coverage_when_sigmas_are_too_small():
     """Stated sigmas of half the truth: chi2/dof is 4, and the widened region still holds."""
     poses = paper_poses(2)

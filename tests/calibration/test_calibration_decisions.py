@@ -116,6 +116,7 @@ def test_a_journal_is_read_as_it_was_written(tmp_path):
     np.testing.assert_array_equal(read[1].measured.covariance, NEW.covariance)
 
 
+@pytest.mark.slow
 @given(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.floats(1e-12, 1e3), st.text(max_size=40))
 def test_numbers_and_words_come_back_bit_by_bit(u, v, variance, why):
     measured = Measured(x=[u, v], covariance=[[variance, 0.0], [0.0, variance]])

@@ -70,6 +70,7 @@ def _zyx_angles(R):
 CASES = mistakes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_the_true_alternative_comes_first(name):
     poses, x = CASES[name]
@@ -163,6 +164,7 @@ def drifting(x, course, size, seed):
     return BallObservations.from_sigma(noisy, 0.0146, pose_id=MIXED.pose_id)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("course", COURSES)
 @pytest.mark.parametrize("size", [0.2, 3.0])
 def test_a_drift_is_not_taken_for_a_wrong_convention(course, size):
@@ -176,6 +178,7 @@ def test_a_drift_is_not_taken_for_a_wrong_convention(course, size):
         assert not any("convention fits" in r for r in cal.reasons)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("course", COURSES)
 @pytest.mark.parametrize("name", ["sign of UVW", "order ZYX", "pairing lag +1"])
 def test_a_wrong_convention_is_found_under_drift(name, course):

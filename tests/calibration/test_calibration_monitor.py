@@ -64,6 +64,7 @@ def test_a_small_lasting_shift_is_found_in_time_by_the_weighted_mean_or_the_step
     assert all(a.parameter == "t_HT_x" for alarms in found for a in alarms)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [5, 15])
 @pytest.mark.parametrize("stated", [1.0, 0.6, 0.0])
 def test_unchanged_machines_raise_few_alarms_whatever_they_state(n, stated):

@@ -83,6 +83,7 @@ def path(scanner):
     return poses, P, circles_of(scanner, P, standard(), rng)
 
 
+@pytest.mark.slow
 def test_the_path_of_an_erring_manipulator_is_found_within_its_uncertainty(scanner, path):
     poses, P, circles = path
     found = tp.calibrate_multi_sphere(scanner, poses, circles, standard())
@@ -98,6 +99,7 @@ def test_the_path_of_an_erring_manipulator_is_found_within_its_uncertainty(scann
     assert np.sqrt(np.mean(without_object_pose(nominal, P, object_points()) ** 2)) > 30 * np.sqrt(np.mean(d**2))
 
 
+@pytest.mark.slow
 def test_home_is_that_of_eq_5(scanner, path):
     """Points of W keep their meaning: the matrices need no other grid than those of the other method."""
     poses, P, circles = path
@@ -106,6 +108,7 @@ def test_home_is_that_of_eq_5(scanner, path):
     assert np.abs(project(found.matrices().P, x) - project(P, x)).max() < 0.6  # 25 um of a plate that errs by 100 um
 
 
+@pytest.mark.slow
 def test_wrong_scanner_values_with_their_sigma_are_found_along_the_path(scanner, path):
     poses, P, circles = path
     off = replace(
@@ -122,6 +125,7 @@ def test_wrong_scanner_values_with_their_sigma_are_found_along_the_path(scanner,
     assert m.points_sigma_shared.min() > 0
 
 
+@pytest.mark.slow
 def test_nobody_s_silence_counts_as_exact(path, scanner):
     poses, _, circles = path
     silent = replace(scanner, sigma={})
@@ -131,6 +135,7 @@ def test_nobody_s_silence_counts_as_exact(path, scanner):
     assert np.mean(found.matrices().points_sigma_shared) > np.mean(exact.matrices().points_sigma_shared)
 
 
+@pytest.mark.slow
 def test_a_circle_that_is_no_ball_does_not_confuse(scanner, path):
     _, P, circles = path
     rng = np.random.default_rng(3)
@@ -146,6 +151,7 @@ def test_a_circle_that_is_no_ball_does_not_confuse(scanner, path):
     np.testing.assert_allclose(more.x_D[:-3], project(P[:1], x_W)[0][which.ball[:-3]], atol=0.1)
 
 
+@pytest.mark.slow
 def test_a_wrong_centre_is_set_aside_and_said(scanner, path):
     poses, _, circles = path
     c = circles[5]
@@ -159,6 +165,7 @@ def test_a_wrong_centre_is_set_aside_and_said(scanner, path):
     assert found.verdict == "trustworthy"
 
 
+@pytest.mark.slow
 def test_views_without_a_pose_are_named_and_have_no_matrix(scanner, path):
     poses, _, circles = path
     none = replace(
@@ -171,6 +178,7 @@ def test_views_without_a_pose_are_named_and_have_no_matrix(scanner, path):
     assert poses.pose_id[9] not in found.matrices().pose_id
 
 
+@pytest.mark.slow
 def test_a_moved_ball_of_the_standard_gives_doubt(scanner, path):
     poses, _, circles = path
     made = standard()
@@ -181,6 +189,7 @@ def test_a_moved_ball_of_the_standard_gives_doubt(scanner, path):
     assert any("K5" in reason for reason in found.reasons)
 
 
+@pytest.mark.slow
 def test_balls_that_hide_one_another_are_left_out(scanner):
     """Two balls on one ray: both have no whole rim, wherever detection thought that it saw one."""
     made = standard()

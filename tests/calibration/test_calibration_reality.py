@@ -151,6 +151,7 @@ def test_the_makers_repeatability_is_the_prior_of_the_scatter():
     assert fine.translation_mm < 0.5 * coarse.translation_mm
 
 
+@pytest.mark.slow
 def test_runs_whose_scanner_is_drawn_from_the_defaults_are_accused_of_nothing():
     from tomopose.calibration.model.assumed import assumed_of
 

@@ -22,6 +22,7 @@ def study():
     return module
 
 
+@pytest.mark.slow
 def test_spread_of_mounts_agrees_with_the_stated_uncertainty(study, shared_data):
     found = study.study(shared_data / "robot-camera-kuka", range(5, 408, 6), joined=5, chance=False)
     assert found["residual_px"] == pytest.approx(0.8, abs=0.1)

@@ -89,6 +89,7 @@ WRITTEN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "convention"), WRITTEN, ids=[" as ".join(key) for key in WRITTEN])
 def test_the_true_reading_of_the_columns_is_advised_alone(name, convention):
     found = diagnose(SCANNER, table(convention, WRITTEN[name, convention]), centres())
@@ -97,6 +98,7 @@ def test_the_true_reading_of_the_columns_is_advised_alone(name, convention):
     assert found.leading[0].remedy in found.advice[0]
 
 
+@pytest.mark.slow
 def test_a_rightly_declared_table_of_each_convention_is_left_alone():
     for name, convention in CONVENTIONS.items():
         columns = {

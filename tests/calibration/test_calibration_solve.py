@@ -51,6 +51,7 @@ def observe(scanner, poses, T_HT, t, sigma=0.0, rng=None, said=0.02):
     return BallObservations.from_sigma(x, said, pose_id=poses.pose_id)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plan", ["grid", "mixed"])
 def test_exact_centres_give_the_exact_mount(scanner, rng, plan):
     poses = grid_poses() if plan == "grid" else mixed_poses(rng)
@@ -69,6 +70,7 @@ def test_exact_centres_give_the_exact_mount(scanner, rng, plan):
         assert cal.pose_id == poses.pose_id
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plan", ["grid", "mixed", "turned"])
 def test_a_thousand_mounts_are_found_from_no_start(scanner, rng, plan):
     """Exact centres, 1e-9 mm and rad, whatever the mount; in "turned" the poses rotate by up to 180 degrees."""

@@ -54,6 +54,7 @@ def test_eight_per_cent_of_outliers_are_found_and_change_nothing(plan, seed):
     assert (np.abs(values_of(cal) - values_of(reference)) < u_of(reference)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("plan", "low", "high"), [("paper", 0.0, 30.0), ("mixed", 0.0, 30.0), ("mixed", 0.05, 0.5)])
 def test_outliers_leave_the_fit_of_the_good_centres(plan, low, high):
     """Against the fit that knows which centres are bad.  Errors of a few sigma come and go at the border: a row that
@@ -261,6 +262,7 @@ def test_exact_centres_are_trustworthy():
     json.dumps(plain(calibration_document(cal)), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_false_alarms_are_rare():
     poses = mixed_poses(n=50)
     verdicts = [calibrate(SCANNER, poses, observe(poses, seed=s)).verdict for s in range(40)]

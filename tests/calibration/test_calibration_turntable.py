@@ -31,6 +31,7 @@ def cal(run):
     return tp.calibrate_turntable(run.scanner, run.poses, run.observations)
 
 
+@pytest.mark.slow
 def test_the_piercing_point_and_the_roll_are_found_from_pixels_and_half_a_degree_away(run, cal):
     found = values(cal)
     for name, limit in (("u_0", 1.0), ("v_0", 1.0), ("eta", 1e-4), ("theta", 5e-3), ("phi", 5e-3)):
@@ -41,6 +42,7 @@ def test_the_piercing_point_and_the_roll_are_found_from_pixels_and_half_a_degree
     np.testing.assert_array_equal(cal.T_HT.matrix, np.eye(4))
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_of_another_generator_and_a_scan_is_as_good_as_stated():
     """Four runs of nine values by a generator without the library's chain; benchmarks/trust/turntable.py runs sixty."""
     inside, ratio = [], []
@@ -54,6 +56,7 @@ def test_intervals_hold_the_truth_of_another_generator_and_a_scan_is_as_good_as_
     assert max(ratio) < 3.5
 
 
+@pytest.mark.slow
 def test_a_table_beside_its_nominal_place_needs_no_word():
     """W is defined by the real axis: its offset and lean come out as u_0, roll and tilts, and the scan is right."""
     table = Table(offset=np.array([0.0, 0.4, 0.0]), lean=(2e-3, 1e-3))
@@ -65,6 +68,7 @@ def test_a_table_beside_its_nominal_place_needs_no_word():
     assert error < 4 * stated
 
 
+@pytest.mark.slow
 def test_the_other_sense_of_the_table_is_named_and_a_mirror_image_is_a_symmetry(cal):
     wrong = turntable_run(np.random.default_rng(5), sense=-1.0)
     found = tp.diagnose_turntable(wrong.scanner, wrong.poses, wrong.observations)

@@ -51,6 +51,7 @@ def problem_of(e: Experiment, machine: Any) -> tuple[KinematicProblem, State]:
 # -- estimator --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_rows_answer_to_every_unknown_as_stated() -> None:
     """The estimator's Jacobian against differences, with two balls, freed scanner parameters and errors."""
     e = hexapod_experiment(HEXAPOD, "mixed", 0, balls=2)
@@ -71,6 +72,7 @@ def test_rows_answer_to_every_unknown_as_stated() -> None:
         np.testing.assert_allclose(at.J[:, :, i] / scale, numeric / scale, atol=2e-4, err_msg=problem.tangent[i])
 
 
+@pytest.mark.slow
 def test_held_out_poses_as_if_refitted() -> None:
     """The closed form of cross-validation against honest refits."""
     e = hexapod_experiment(HEXAPOD, "mixed", 0)
@@ -126,6 +128,7 @@ def test_exact_data_give_the_exact_trajectory() -> None:
 # -- unknown kinematics -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_one_ball_cannot_determine_rotations_without_kinematics() -> None:
     e = hexapod_experiment(HEXAPOD, "mixed", 0)
     rigid = calibrate(e.scanner, e.poses, e.observations, model="rigid", hypotheses=False)
@@ -149,6 +152,7 @@ def test_slacks_follow_the_residuals() -> None:
 # -- something changed ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0.0, 1.0])
 def test_changed_pivot_is_named(size: float) -> None:
     """From pose 100 on the controller turns about another pivot; the table's numbers do not show it."""
@@ -172,6 +176,7 @@ def test_changed_pivot_is_named(size: float) -> None:
     assert re.match(r"the pivot of the controller changed at pose 100, by 5\.[34]e\+02 um", changed.words)
 
 
+@pytest.mark.slow
 def test_quiet_runs_raise_no_alarm() -> None:
     for seed in range(3):
         e = hexapod_experiment(HEXAPOD, "mixed", seed)
@@ -220,6 +225,7 @@ def test_chain_of_the_other_arrangement_by_hand(rng: np.random.Generator) -> Non
         np.testing.assert_allclose(x[k], h[:2] / h[2], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("machine_errors", [False, True])
 def test_moving_scanner_is_calibrated(machine_errors: bool, rng: np.random.Generator) -> None:
     scanner, poses, T_MT, ball = carm(rng)
@@ -312,6 +318,7 @@ def ball_views(scanner: Scanner, n: int, rng: np.random.Generator) -> tuple[list
     return views, true
 
 
+@pytest.mark.slow
 def test_exact_views_give_exact_poses(scanner: Scanner, rng: np.random.Generator) -> None:
     views, true = ball_views(scanner, 12, rng)
     for view, T in zip(views, true, strict=True):
@@ -333,6 +340,7 @@ def test_pose_uncertainty_is_honest(scanner: Scanner, rng: np.random.Generator) 
     assert 4.8 < np.mean(squares) < 7.4
 
 
+@pytest.mark.slow
 def test_ball_object_calibrates_itself(scanner: Scanner, rng: np.random.Generator) -> None:
     """Coarse coordinates (0.3 mm) become good to micrometres; one known distance gives the scale."""
     views, _ = ball_views(scanner, 40, rng)
@@ -372,6 +380,7 @@ def test_views_with_missing_balls(scanner: Scanner, rng: np.random.Generator) ->
 # -- planning ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_planned_poses_beat_random_ones_and_keep_their_promise() -> None:
     rng = np.random.default_rng(8)
     T_HT = RigidTransform.from_angles([0.0, 0.0, np.pi], [1.0, 2.0, 1.0], source=Frame.H, target=Frame.T)

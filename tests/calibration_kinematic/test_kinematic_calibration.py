@@ -51,6 +51,7 @@ def found(e: Experiment, model: str = "auto", **options: Any) -> Calibration:
     return calibrate_kinematic(e.scanner, poses, observations, rigid=rigid, model=model, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "options", "goal_px"),
     [("paper", {}, 0.08), ("mixed", {}, 0.02), ("mixed", {"geometry": 1.08}, 0.025), ("mixed", {"balls": 2}, 0.012)],
@@ -69,6 +70,7 @@ def test_platform_errors_are_found(kind: str, options: dict[str, Any], goal_px: 
     assert cal.verdict == "trustworthy", cal.reasons
 
 
+@pytest.mark.slow
 def test_stated_uncertainty_covers() -> None:
     """Squared errors in stated standard deviations average to about 1 over seeded runs (a few directions dominate)."""
     share, ratio = [], []
@@ -81,6 +83,7 @@ def test_stated_uncertainty_covers() -> None:
     assert 0.4 < np.mean(ratio) < 1.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["paper", "mixed"])
 def test_a_perfect_machine_stays_rigid(kind: str) -> None:
     e = hexapod_experiment(HEXAPOD, kind, 1, size=0.0)
@@ -93,6 +96,7 @@ def test_a_perfect_machine_stays_rigid(kind: str) -> None:
     assert models["kinematic"].log_evidence < models["rigid"].log_evidence + SELECTION.evidence_gain
 
 
+@pytest.mark.slow
 def test_small_errors_get_a_small_prior() -> None:
     """A machine fifty times better than its file says: the errors' size is taken from the data."""
     e = hexapod_experiment(HEXAPOD, "mixed", 0, size=0.02)
@@ -102,6 +106,7 @@ def test_small_errors_get_a_small_prior() -> None:
     assert {m.model: m.size for m in cal.comparison.models}["kinematic"] < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["paper", "mixed"])
 @pytest.mark.parametrize("worn", [{"backlash_mm": 0.003}, {"leg_backlash_mm": 0.003}])
 def test_backlash_and_drift_do_not_ruin_it(kind: str, worn: dict[str, float]) -> None:
@@ -119,6 +124,7 @@ def test_backlash_and_drift_do_not_ruin_it(kind: str, worn: dict[str, float]) ->
     assert any("drifted" in reason for reason in cal.reasons)
 
 
+@pytest.mark.slow
 def test_leg_backlash_follows_the_scan() -> None:
     """The identified lag, applied in the order of the scan's moves, halves what is left without it."""
     e = hexapod_experiment(HEXAPOD, "mixed", 2, disturbance=Disturbance(leg_backlash_mm=0.003))
@@ -133,11 +139,13 @@ def test_leg_backlash_follows_the_scan() -> None:
     assert off.max() < 0.006
 
 
+@pytest.mark.slow
 def test_robot_on_the_table() -> None:
     e = robot_experiment(ROBOT, 1, table=True)
     assert scan_error(found(e), e).shared < scan_error(rigid_of(e), e).shared / 20
 
 
+@pytest.mark.slow
 def test_scale_of_a_robot_alone_is_as_good_as_its_links() -> None:
     """With one ball and the table still, what is left is the scale of the object, whatever the poses; a message says
     so."""
@@ -167,6 +175,7 @@ def test_a_robot_may_grow_about_the_source_unseen() -> None:
     np.testing.assert_allclose(again, seen, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_planned_poses_of_a_robot() -> None:
     """With table angles the plan determines the scale; without, it says what it leaves."""
     still, turned = (
@@ -192,6 +201,7 @@ def test_planned_poses_of_a_robot() -> None:
     np.testing.assert_allclose(ROBOT.forward(turned.poses.q).t, turned.poses.T_MH.t, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_robot_alone_needs_one_known_length() -> None:
     """All of a robot's lengths with the ball and the distance to the source can grow together; a scale bar stops it."""
     e = robot_experiment(ROBOT, 1, balls=2)
@@ -220,6 +230,7 @@ def test_matrices_of_a_robot_whose_base_is_behind_the_source() -> None:
     np.testing.assert_allclose(near.points_sigma, projection_matrices(cal, scan).points_sigma, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_cartesian_log_of_a_robot_gives_the_same() -> None:
     e = robot_experiment(ROBOT, 0, n=60, table=True, spin=1.0, tilt_deg=8.0)  # one branch of the wrist throughout
     cartesian = replace(e.poses, q=None)
@@ -227,6 +238,7 @@ def test_cartesian_log_of_a_robot_gives_the_same() -> None:
     np.testing.assert_allclose(a.errors.values, b.errors.values, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_gross_errors_are_set_aside() -> None:
     e = hexapod_experiment(HEXAPOD, "mixed", 0)
     x = e.observations.x_D.copy()
@@ -270,6 +282,7 @@ def test_wrong_calls_are_refused() -> None:
             calibrate_kinematic(e.scanner, e.poses, e.observations, rigid=rigid, **options)
 
 
+@pytest.mark.slow
 def test_result_survives_its_file(tmp_path: Any) -> None:
     e = hexapod_experiment(HEXAPOD, "mixed", 0)
     cal = found(e)
@@ -281,6 +294,7 @@ def test_result_survives_its_file(tmp_path: Any) -> None:
     assert scan_error(again, e) == scan_error(cal, e)
 
 
+@pytest.mark.slow
 def test_deterministic_and_independent_of_row_order() -> None:
     e = hexapod_experiment(HEXAPOD, "mixed", 0)
     order = np.random.default_rng(1).permutation(len(e.observations))

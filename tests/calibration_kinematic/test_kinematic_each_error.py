@@ -53,6 +53,7 @@ def hexapod_with(group: str, size: float = 1.0) -> Experiment:
     return experiment(ANY, p, mixed_poses(rng), tilted_scan(MOUNT), T_HT=MOUNT, balls=[[12.0, -14.0, 10.0]], rng=rng)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", ["base_joint", "platform_joint", "leg_offset", "leg_scale", "axes"])
 def test_one_group_of_errors_alone(group: str) -> None:
     e = hexapod_with(group)
@@ -66,6 +67,7 @@ def test_one_group_of_errors_alone(group: str) -> None:
     assert 0.9 < after.inside < 0.99
 
 
+@pytest.mark.slow
 def test_a_wrong_pivot_alone_does_no_harm() -> None:
     """The controller turns about another point than it says: mount and ball take it up, and no scan is wrong."""
     e = hexapod_with("pivot")
@@ -74,6 +76,7 @@ def test_a_wrong_pivot_alone_does_no_harm() -> None:
     assert scan_error(rigid, e).shared < 0.006
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["tool", "gear", "alpha"])
 def test_robot_with_one_error(what: str) -> None:
     """A wrong tool is taken up by ball and object; eccentric gears and twisted links are found."""
@@ -104,6 +107,7 @@ def test_robot_with_one_error(what: str) -> None:
 # -- the optimum ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "seed"), [("paper", 1), ("mixed", 2)])
 def test_no_other_solver_finds_less(kind: str, seed: int) -> None:
     """A long run of SciPy's trust-region solver on the same cost, from some sigmas away, ends in the same place."""

@@ -69,6 +69,7 @@ def test_the_file_is_found_inside_other_models() -> None:
         ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("geometry", "limit"), [(1.0, 0.022), (1.08, 0.03)])
 def test_right_and_wrong_files_give_a_good_scan(geometry: float, limit: float) -> None:
     """Scans of 8 deg beyond the calibrated 5 deg; the stated uncertainty holds for both."""

@@ -40,6 +40,7 @@ def rules(cal: Calibration) -> set[str]:
     return {f.rule for f in cal.checks}
 
 
+@pytest.mark.slow
 def test_a_scanner_value_beyond_what_was_assumed_is_freed_beside_the_errors(hexapod: Experiment) -> None:
     """The rigid fit of such a machine pulls a dozen values; beside its errors only the wrong one is left."""
     wrong = replace(hexapod.scanner, u_0=hexapod.scanner.u_0 + 4.0, sigma={})
@@ -63,6 +64,7 @@ def bumped(e: Experiment, cal: Calibration, at: int) -> tp.BallObservations:
     return replace(e.observations, x_D=e.observations.x_D + late[:, None] * (there - here))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [120, 180])
 def test_a_mount_that_is_bumped_is_named_at_its_pose_beside_the_errors(hexapod: Experiment, at: int) -> None:
     cal = identified(hexapod, observations=bumped(hexapod, identified(hexapod), at))
@@ -71,6 +73,7 @@ def test_a_mount_that_is_bumped_is_named_at_its_pose_beside_the_errors(hexapod: 
     assert any(f.remedy.startswith(f"calibrate with the poses before {at}") for f in named)
 
 
+@pytest.mark.slow
 def test_a_closing_pose_that_is_off_is_never_silent_beside_the_errors(hexapod: Experiment) -> None:
     again = np.append(np.arange(188), 0)
     T = hexapod.poses.T_MH
@@ -102,6 +105,7 @@ def test_what_no_ball_shows_and_the_scatter_are_assumed_and_in_the_scan(hexapod:
     assert with_ > without
 
 
+@pytest.mark.slow
 def test_scatter_that_chi2_does_not_show_is_what_the_residuals_leave_room_for() -> None:
     """A machine that is quieter than its data sheet, as it says, and half again as restless."""
     found = []

@@ -49,6 +49,7 @@ def test_source_that_stays_is_eq6(twins: TwinExperiment) -> None:
     np.testing.assert_allclose(b.source, 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_and_matrices(twins: TwinExperiment) -> None:
     """Jacobians against differences; matrices project the ball where the blocks say."""
     e = twins
@@ -73,6 +74,7 @@ def test_derivatives_and_matrices(twins: TwinExperiment) -> None:
     np.testing.assert_allclose(project(P, e.ball[None])[:, 0], b.x_D, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_errors_of_both_robots_are_found(twins: TwinExperiment, tmp_path: Path) -> None:
     e = twins
     rigid, cal = calibrated(e, "rigid"), calibrated(e)
@@ -127,6 +129,7 @@ def test_what_views_cannot_determine_of_the_panel_is_refused(twins: TwinExperime
     assert "d_SD" not in u, "it only names a focal spot"
 
 
+@pytest.mark.slow
 def test_starts_of_the_balls_are_found(twins: TwinExperiment) -> None:
     e = twins
     cal = calibrate_twin(e.scanner, e.poses, e.observations, twin=e.twin, mount=e.mount)
@@ -161,6 +164,7 @@ def test_wrong_calls_are_refused(twins: TwinExperiment) -> None:
         replace(e.twin, base_t_sigma=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("whose", ["detector", "source"])
 def test_a_wrong_reading_of_either_robots_table_is_named(whose: str) -> None:
     e = twin_experiment(ROBOT, 2, n=60, size=0.3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from manipulator_cases import Experiment, hexapod_experiment
 
 from tomopose import BallObservations, Calibration
@@ -18,6 +19,7 @@ def found(e: Experiment, observations: BallObservations) -> Calibration:
     return calibrate(e.scanner, e.poses, observations, manipulator=HEXAPOD, model="kinematic", hypotheses=False)
 
 
+@pytest.mark.slow
 def test_images_that_drift_by_a_pixel_are_doubtful() -> None:
     e = hexapod_experiment(HEXAPOD, "mixed", 0)
     x = e.observations.x_D + np.linspace(0.0, 1.0, len(e.poses))[:, None] * [0.8, -0.6]

@@ -146,6 +146,7 @@ sys.exit(run(["export", "--matrices", str(out / "m.npz"), "--to", "cil,cera,leap
 """
 
 
+@pytest.mark.slow
 def test_nothing_needs_a_network(tmp_path):
     apart = [shutil.which("unshare") or "unshare", "--map-root-user", "--net"]
     try:

@@ -91,6 +91,7 @@ def gantry(tmp_path, scanner, rng):
     return tmp_path, machine, p, scan, P, balls, mount
 
 
+@pytest.mark.slow
 def test_moving_scanner_from_files_to_matrices(gantry, capsys):
     folder, _, _, _, truth, balls, _ = gantry
     moving = ("--arrangement", "moving-scanner")
@@ -134,6 +135,7 @@ def test_a_d_sd_that_varies_from_view_to_view_is_not_trusted(tmp_path, scanner, 
     assert calibrate(tmp_path, "cal", "--arrangement", "moving-scanner") == code
 
 
+@pytest.mark.slow
 def test_commands_move_the_scanner_where_it_was_wanted(gantry):
     """The machine that errs, commanded so, images as a perfect one with the mount that was found."""
     folder, machine, p, scan, _, _, mount = gantry
@@ -153,6 +155,7 @@ def test_commands_move_the_scanner_where_it_was_wanted(gantry):
     assert commanded < plain / 10
 
 
+@pytest.mark.slow
 def test_a_moving_scanner_of_unknown_kinematics(gantry, capsys):
     """A map of pose errors serves the inverse chain too, and says what the balls cannot determine."""
     folder, truth = gantry[0], gantry[4]
@@ -204,6 +207,7 @@ def test_a_convention_that_is_wrong_is_found_for_a_moving_scanner_too(gantry):
     assert best.name == "sign of V"
 
 
+@pytest.mark.slow
 def test_one_more_number_a_view(gantry, scanner, rng):
     """A C-arm that sags: d_SD differs from view to view; a robot with joint columns alone."""
     folder = gantry[0]
@@ -347,6 +351,7 @@ def twin_words(folder, *more):
     return ("--twin", folder / "twin.json", "--source-poses", folder / "source.csv", *more)
 
 
+@pytest.mark.slow
 def test_twin_robots_from_files_to_matrices(twins, capsys):
     from tomopose.manipulator.twin_file import read_twin
 
@@ -384,6 +389,7 @@ def twin_error(found, e, x_M):
     return rms_px(d), float(np.sqrt(2 * np.mean(found.points_sigma_shared**2)))
 
 
+@pytest.mark.slow
 def test_joint_values_alone_serve_twin_robots(twins):
     folder, _ = twins
     for name in ("poses", "source", "scan", "scan_source"):
@@ -401,6 +407,7 @@ def test_joint_values_alone_serve_twin_robots(twins):
     assert matrices(folder, "rigid", "--source-poses", folder / "scan_source.csv", *twin) == 0
 
 
+@pytest.mark.slow
 def test_a_pitch_may_be_freed_and_the_mount_takes_the_rest(twins, capsys):
     folder, e = twins
     content = json.loads((folder / "scanner.json").read_text())

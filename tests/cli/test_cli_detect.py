@@ -46,6 +46,7 @@ def words(folder, verb, out, *more):
     ]
 
 
+@pytest.mark.slow
 def test_detect_writes_a_row_for_each_radiograph_and_names_the_missing_flat_field(radiographs, tmp_path, capsys):
     out = tmp_path / "observations.csv"
     assert run(words(radiographs, "detect", out, "--ball-diameter-mm", str(DIAMETER))) == 0

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 import tomopose as tp
 from tomopose.cli.main import run
@@ -54,6 +55,7 @@ def test_nothing_fits_is_an_answer_with_exit_code_3(files, capsys):
     assert shown["answer"] == "nothing fits"
 
 
+@pytest.mark.slow
 def test_a_turning_table_alone_has_its_own_method(tmp_path, capsys):
     """Refused with a pointer without it; calibrated, diagnosed and made into matrices with it."""
     rng = np.random.default_rng(2)

@@ -56,6 +56,7 @@ def scan_error(folder, cal, truth):
     return rms_px(without_object_pose(tp.read_matrices(folder / f"{cal}.npz").P, truth, CORNERS))
 
 
+@pytest.mark.slow
 def test_identified_errors_improve_the_scan(erring):
     folder, _, _, _, truth = erring
     assert calibrate(folder, "--model", "rigid", "--out", folder / "rigid") == 3
@@ -64,6 +65,7 @@ def test_identified_errors_improve_the_scan(erring):
     assert scan_error(folder, "auto", truth) < scan_error(folder, "rigid", truth) / 10
 
 
+@pytest.mark.slow
 def test_commands_make_the_real_machine_reach_the_poses(erring):
     folder, machine, p, scan, _ = erring
     assert calibrate(folder, "--manipulator", folder / "hexapod.json", "--out", folder / "cal") == 0
@@ -95,6 +97,7 @@ def test_scale_bars_are_written_one_way(erring, capsys):
     assert "--distance" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_matrices_separate_the_shared_part_from_the_scatter(erring, capsys):
     folder = erring[0]
     assert calibrate(folder, "--manipulator", folder / "hexapod.json", "--out", folder / "cal") == 0
@@ -113,6 +116,7 @@ def test_matrices_separate_the_shared_part_from_the_scatter(erring, capsys):
     assert run([*map(str, [*words, "--quiet", "--home", "nowhere", "--out", folder / "x.npz"])]) == 1
 
 
+@pytest.mark.slow
 def test_the_plan_of_a_robot_alone_says_that_its_links_hold_the_scale(tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "benchmarks" / "manipulator"))
     from manipulator_cases import robot_experiment
@@ -147,6 +151,7 @@ def test_the_plan_of_a_robot_alone_says_that_its_links_hold_the_scale(tmp_path, 
         assert ("use table angles or a known distance between two balls" in text) == told
 
 
+@pytest.mark.slow
 def test_plan_for_a_robot_says_what_the_table_angles_are_for(erring, capsys):
     from tomopose.manipulator.virtual import typical_robot
 
@@ -212,6 +217,7 @@ def rewritten(folder, **columns):
     tp.write_poses(folder / "poses.csv", replace(poses, **columns))
 
 
+@pytest.mark.slow
 def test_exchanged_balls_and_a_new_pivot_are_named(erring, scanner, T_HT, capsys):
     folder, machine, p, _, _ = erring
     poses = tp.read_poses(folder / "poses.csv")

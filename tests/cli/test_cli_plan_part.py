@@ -53,6 +53,7 @@ def words(tmp_path) -> list[str]:
     return ["plan", "scan", *itertools.chain(*((f"--{k}", str(tmp_path / v)) for k, v in files.items()))]
 
 
+@pytest.mark.slow
 def test_a_planned_scan_comes_with_its_figures_its_page_and_the_machine_list(words, tmp_path, capsys):
     assert run([*words, "--mu-per-mm", "0.05", "--views", "9", "--commands", "pi-gcs", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
@@ -76,6 +77,7 @@ def test_a_planned_scan_comes_with_its_figures_its_page_and_the_machine_list(wor
     np.testing.assert_allclose(back.T_MH.t, poses.T_MH.t, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_material_is_looked_up_and_the_assumed_voltage_is_said(words, tmp_path, capsys):
     assert run([*words, "--material", "Al", "--views", "4"]) == 0
     out = capsys.readouterr().out
@@ -135,6 +137,7 @@ def test_the_defaults_of_the_options_are_those_of_the_library():
         assert getattr(options, option) == getattr(settings, option), option
 
 
+@pytest.mark.slow
 def test_a_continuous_scan_writes_its_way_and_says_whether_fdk_follows_it(words, tmp_path, capsys):
     (tmp_path / "limits.toml").write_text("[travel]\nz_mm = [0, 0.5]\nrx_deg = [-3, 3]\nry_deg = [-3, 3]\n")
     assert run([*words, "--mu-per-mm", "0.05", "--views", "16", "--continuous"]) == 0

@@ -64,6 +64,7 @@ def words(folder, *more):
     return [*map(str, [*given, "--size", 45, "--out", folder / "volume.h5", *more])]
 
 
+@pytest.mark.slow
 def test_the_ball_lies_where_it_was(scan, capsys):
     assert run(words(scan, "--images-are", "transmission", "--json")) == 0
     shown = json.loads(capsys.readouterr().out)
@@ -112,6 +113,7 @@ def test_the_middle_of_the_volume_may_lie_anywhere(scan):
     assert_allclose(np.argwhere(volume.values > MU / 2).mean(axis=0), 22.0, atol=0.2)
 
 
+@pytest.mark.slow
 def test_a_mask_keeps_the_rest_empty_and_must_lie_on_the_grid(scan, capsys):
     grid = tp.VoxelGrid.cube(n=45, spacing=0.6)
     allowed = np.zeros(grid.shape, dtype=np.float32)
@@ -124,6 +126,7 @@ def test_a_mask_keeps_the_rest_empty_and_must_lie_on_the_grid(scan, capsys):
     assert "other.h5: its grid is not" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_bad_pixels_are_left_out(scan, capsys):
     bad = np.zeros((55, 61), dtype=np.uint8)
     bad[20, 30:32] = 1
@@ -138,6 +141,7 @@ def test_bad_pixels_are_left_out(scan, capsys):
     assert np.isfinite(tp.read_volume(scan / "volume.h5").values).all()
 
 
+@pytest.mark.slow
 def test_beam_hardening_of_a_known_material_is_taken_out(scan, capsys):
     scene = scan / "scene.toml"
     scene.write_text(SCENE, encoding="utf-8")
@@ -176,6 +180,7 @@ def test_voxels_may_have_three_sides(scan, capsys):
     assert "--voxel-mm" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_algorithm_chosen_is_said_and_kept(scan, capsys):
     assert run(words(scan, "--images-are", "transmission")) == 0
     choice = "fdk: the source makes a smooth full turn of 48 views"
@@ -209,6 +214,7 @@ def test_the_paper_may_be_said_twice(scan, capsys):
     assert (settings["algorithm"], settings["order"], settings["seed"]) == ("sart", "random", 3)
 
 
+@pytest.mark.slow
 def test_a_volume_that_contradicts_its_views_ends_with_3_and_names_them(scan, capsys):
     images = sorted((scan / "scan").iterdir())
     stack = [tp.open_images(path)[0].copy() for path in images]
@@ -221,6 +227,7 @@ def test_a_volume_that_contradicts_its_views_ends_with_3_and_names_them(scan, ca
     assert not tp.read_volume(scan / "volume.h5").trustworthy
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_other_images_starts_anew_in_words(scan, capsys):
     state = scan / "state"
     more = ["--images-are", "transmission", "--checkpoint", str(state), "--force"]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 
+import pytest
+
 import tomopose as tp
 from tomopose.cli.main import run
 
@@ -33,6 +35,7 @@ def scene(path, poses=GRID):
     return str(path)
 
 
+@pytest.mark.slow
 def test_each_scene_and_grid_has_a_folder(tmp_path, capsys):
     given = [scene(tmp_path / "a.toml"), scene(tmp_path / "b.toml")]
     assert run(["simulate", *given, "--grid", "1,2", "--out", str(tmp_path / "out"), "--json"]) == 0

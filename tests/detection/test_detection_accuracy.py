@@ -43,6 +43,7 @@ def bound(small: list[Crop]) -> float:
     return float(np.sqrt(np.trace(cramer_rao(small[0][0], small[0][1], 1.0))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("snr", "ratio"), [(50, 1.45), (200, 1.5), (400, 1.8)])
 def test_error_is_near_the_bound(small: list[Crop], bound: float, snr: float, ratio: float) -> None:
     """The benchmark shows 1.25 (1.6 at SNR 400) on many crops; 30 here leave 9 % of chance."""

@@ -52,6 +52,7 @@ def test_the_frames_that_were_lost(shared_data: Path) -> None:
         assert ball.status == "ok"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("snr", [50.0, 200.0])
 def test_blurred_balls_are_measured_to_the_bound(snr: float) -> None:
     """28 images of seven kinds: error / bound below 1.3 and a variance of about 1, within three times their chance."""

@@ -69,6 +69,7 @@ def test_rows_and_progress(run: tuple[Scanner, list[np.ndarray], np.ndarray]) ->
     assert calls == [(k, 6) for k in range(1, 7)]
 
 
+@pytest.mark.slow
 def test_the_same_bytes_whatever_does_the_work(run: tuple[Scanner, list[np.ndarray], np.ndarray]) -> None:
     distributed = pytest.importorskip("distributed")
     scanner, images, _ = run
@@ -139,6 +140,7 @@ def test_a_fault_of_all_images_is_an_error(run: tuple[Scanner, list[np.ndarray],
         detect_image(images[0], scanner, origin=(40, 40), ball_diameter=8.0)
 
 
+@pytest.mark.slow
 def test_lag_of_the_previous_pose_is_corrected(run: tuple[Scanner, list[np.ndarray], np.ndarray]) -> None:
     """3 % of the previous image: measured where its rim lies clear of the ball, and known from there elsewhere.
 

@@ -78,6 +78,7 @@ def observations(images: list[Array]) -> BallObservations:
     return detect(images, SCANNER, ball_diameter=5.0)
 
 
+@pytest.mark.slow
 def test_every_ball_is_found_and_none_is_wrong(images: list[Array], observations: BallObservations) -> None:
     assert observations.seen.all()
     independent = np.array([half_height_centre(np.asarray(image, dtype=np.float64)) for image in images])

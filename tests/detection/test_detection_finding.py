@@ -40,6 +40,7 @@ def plain() -> tuple[Scene, Array]:
     return scene, frame(scene)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [8.0, 17.0, 90.0, 180.0])
 @pytest.mark.parametrize("inverted", [False, True])
 def test_any_size_and_polarity(radius: float, inverted: bool) -> None:

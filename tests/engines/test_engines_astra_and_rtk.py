@@ -92,6 +92,7 @@ def test_answers_are_checked():
         require_returned(np.full((2, 2), np.nan), (2, 2), "rtk")
 
 
+@pytest.mark.slow
 @pytest.mark.authority
 @pytest.mark.skipif(not rtk.availability().available, reason="itk-rtk is not installed")
 def test_rtk_projects_alike_away_from_the_outer_faces(rng):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -86,6 +87,7 @@ def difference(found: np.ndarray, expected: np.ndarray, where: np.ndarray) -> fl
     return apart / span if span > 0 else (math.inf if apart > 0 else 0.0)
 
 
+@pytest.mark.slow
 @settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(scene=scenes(), seed=st.integers(0, 2**31), weight=st.sampled_from(["sum", "mean", "inverse-square"]))
 def test_any_scene_gives_what_the_reference_gives(scene, seed, weight):

@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 PROGRAM = """
 import sys
 import llvmlite.binding
@@ -29,6 +31,7 @@ assert states[0].max() > 0.1
 """
 
 
+@pytest.mark.slow
 def test_eight_lanes_give_the_same(tmp_path):
     # A cache of its own: numba files compiled code by processor, and this one is lied to about it.
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}

@@ -34,6 +34,7 @@ def rounding_of_pitch(matrices):
     return 4 * np.finfo(float).eps * farthest / (min(matrices.n_u, matrices.n_v) / 2)
 
 
+@pytest.mark.slow
 @given(matrices=geometries())
 @QUICK
 def test_every_format_comes_back(matrices, tmp_path_factory):

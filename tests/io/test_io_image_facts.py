@@ -70,6 +70,7 @@ def test_smaller_copies_of_a_page_are_passed_over_and_said(tmp_path):
     assert any("NewSubfileType" in w for w in images.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["orient1.tif", "orient2.tif", "orient3.tif", "orient4.tif", "thumbnail16.tif"])
 def test_a_ball_is_found_in_one_place_however_its_image_is_stored(name, shared_data):
     folder = shared_data / "cases" / "tiff-orientation"

@@ -262,6 +262,7 @@ def mean_of(images, k: int) -> float:
     return float(images[k].mean())
 
 
+@pytest.mark.slow
 def test_worker_processes_can_read(folder, tmp_path, stack):
     write_hdf5(tmp_path / "s.h5", stack)
     for images in (open_images(folder), open_images(tmp_path / "s.h5")):

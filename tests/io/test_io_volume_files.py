@@ -56,6 +56,7 @@ def test_hdf5_keeps_all_that_a_volume_knows(volume, tmp_path):
         assert np.allclose(file["volume"].attrs["spacing_mm"], [0.1, 0.2, 0.3])
 
 
+@pytest.mark.slow
 @pytest.mark.authority
 @pytest.mark.parametrize("suffix", [".nrrd", ".mhd"])
 def test_itk_sees_the_same_place(suffix, volume, tmp_path):

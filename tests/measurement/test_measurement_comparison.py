@@ -177,6 +177,7 @@ def test_probed_points_from_a_table(tmp_path):
         read_probed_points(path)
 
 
+@pytest.mark.slow
 def test_smaller_triangles_lie_on_the_same_surface():
     coarse = box(np.array([1.0, 0.4, 0.7]), 1)
     fine = refined(coarse, 0.13)

@@ -109,6 +109,7 @@ def correlated_height(length, runs, rng, reach=2.0):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [0.05, 0.4, 0.7])
 def test_common_errors_of_neighbours_widen_the_uncertainty_by_what_they_cost(length):
     runs = 60
@@ -120,6 +121,7 @@ def test_common_errors_of_neighbours_widen_the_uncertainty_by_what_they_cost(len
     assert np.std(stated) / np.mean(stated) < 1.5 * np.sqrt(2 / np.median([f.dof for f in fits]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("correlated", [True, False])
 def test_points_weigh_by_the_areas_they_represent(correlated):
     """Half of the points crowd together.  The stated uncertainty is that of the mean weighed by areas, w' C w; where
@@ -184,6 +186,7 @@ def test_both_components_of_a_line_count():
     assert np.mean([f.n_effective for f in found]) == pytest.approx(400, rel=0.25)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-50, 50)] * 3))
 def test_a_motion_moves_the_feature_and_nothing_else(w, shift):

@@ -126,6 +126,7 @@ def test_a_clean_block(plan):
     assert by_name["height"].value == pytest.approx(CENTRE[2] + HALF[2], abs=2e-6)
 
 
+@pytest.mark.slow
 def test_groups_of_repeats_side_by_side_and_their_files(document, tmp_path):
     """Three scans repeat one measurement; a fourth is another trajectory and no repeat of them."""
     document["repeats"] = {"3D scan": ["scan 0", "scan 1", "scan 2"]}
@@ -185,6 +186,7 @@ def test_the_form_of_a_dent_is_its_depth(document):
     assert f"{found['kept'].n_set_aside} points set aside" in found["kept"].method
 
 
+@pytest.mark.slow
 def test_a_form_beyond_its_tolerance_does_not_conform_unless_noise_makes_it(document):
     document["measurands"] = [{"name": "flatness", "kind": "form", "of": ["top"], "tolerance_mm": 0.01}]
     dent = measure(dented(0.05), plan_from(document)).results[0]
@@ -250,6 +252,7 @@ class TestStatedTerms:
         assert budget.U_error > budget.U
         assert "workpiece" in found.budgets_csv().splitlines()[0]
 
+    @pytest.mark.slow
     def test_an_unstated_uncertainty_of_the_reference_proves_no_conformity(self, document):
         del document["measurands"][0]["u_calibrated_mm"]
         found = measure(block(), plan_from(document))
@@ -263,6 +266,7 @@ class TestStatedTerms:
         assert {r.name: r for r in found.results}["flatness"].reference == 0.0
 
 
+@pytest.mark.slow
 def test_volumes_are_no_repeats_unless_the_plan_says_so(plan):
     found = measure({"circular": block(0.03, 1), "tilted": block(0.03, 2)}, plan)
     assert found.repeats() == ()
@@ -389,6 +393,7 @@ class TestDatums:
             self.found(self.ball, self.plane, self.side)
 
 
+@pytest.mark.slow
 def test_the_same_numbers_twice(plan):
     one, two = (measure(block(0.03, 7), plan) for _ in range(2))
     assert [r.value for r in one.results] == [r.value for r in two.results]

@@ -67,6 +67,7 @@ def test_clean_centres_and_the_known_curvature_bias(balls, clean):
     assert not found.corrected
 
 
+@pytest.mark.slow
 def test_the_correction_removes_the_curvature_bias_and_says_so(balls, clean):
     grid, centres = balls
     found = surface(clean, curvature_correction=True)
@@ -256,6 +257,7 @@ def test_probing_searches_far(balls, clean):
     assert fit_sphere(found.points[found.good]).radius / V == pytest.approx(R - SIGMA**2 / R, abs=3e-3)
 
 
+@pytest.mark.slow
 def test_stated_intervals_hold_the_truth():
     """The height of a plane under noise: 95 % intervals in 120 volumes with known truth."""
     grid = VoxelGrid(shape=(20, 26, 30), spacing=np.full(3, 0.1))

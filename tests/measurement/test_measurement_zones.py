@@ -68,6 +68,7 @@ def errors(kind, feature, known):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "criterion"), CASES)
 def test_the_solution_is_right_where_it_is_known_by_construction(kind, criterion):
     worst = {}

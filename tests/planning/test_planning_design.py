@@ -45,6 +45,7 @@ def turned_plan(paper_scanner):
     return plan_poses(paper_scanner, t=BALL, limits=TURNED, settings=DesignSettings(maker=STILL))
 
 
+@pytest.mark.slow
 def test_thirty_images_with_two_table_angles_match_the_paper_grid(turned_plan):
     assert turned_plan.reference == pytest.approx(0.0023, abs=1e-4)
     assert turned_plan.predicted <= turned_plan.reference
@@ -121,11 +122,13 @@ def test_the_prediction_holds_what_a_calibration_assumes(turned_plan, silent_sca
     assert plan.exact > turned_plan.predicted
 
 
+@pytest.mark.slow
 def test_a_goal_counts_what_nobody_stated(silent_scanner):
     with pytest.raises(NotObservableError, match="state the sigmas of the scanner's values"):
         plan_poses(silent_scanner, t=BALL, goal=0.005, limits=PlanLimits(total_time=400.0), settings=ALONE)
 
 
+@pytest.mark.slow
 def test_the_paper_plan_of_an_unstated_scanner_is_worse_than_two_angles(silent_scanner):
     plan = plan_poses(silent_scanner, t=BALL, limits=TURNED, settings=ALONE)
     assert len(plan) <= 60
@@ -187,6 +190,7 @@ def test_time_bounds_the_number_of_images(paper_scanner):
         plan_poses(paper_scanner, t=BALL, n=100, limits=PlanLimits(total_time=150.0), settings=ALONE)
 
 
+@pytest.mark.slow
 def test_a_goal_out_of_reach_is_refused(paper_scanner):
     with pytest.raises(NotObservableError, match="images reach"):
         plan_poses(paper_scanner, t=BALL, goal=1e-5, settings=ALONE)

@@ -189,6 +189,7 @@ def test_a_plan_keeps_to_narrow_one_sided_and_empty_intervals(small_scanner):
     assert len(plan) == 12
 
 
+@pytest.mark.slow
 def test_a_plan_is_worth_more_than_the_usual_paths_and_near_its_bound(small_scanner):
     plan = plan_part_scan(setting(small_scanner))
     assert max(j.worth.J for j in plan.paths.values()) < plan.chosen.worth.J
@@ -235,6 +236,7 @@ def test_an_order_keeps_the_set_and_never_lengthens(small_scanner, rng):
     assert travel(machine, ends) == pytest.approx(math.degrees(0.2))
 
 
+@pytest.mark.slow
 def test_what_hits_an_obstacle_is_left_out(small_scanner):
     task = setting(small_scanner)
     wall = Obstacle(name="wall", mesh=box(np.array([1.0, 40.0, 40.0]), centre=(11.0, 0.0, 0.0)))
@@ -299,6 +301,7 @@ def test_limits_that_contradict_themselves_or_are_misspelt_are_refused(tmp_path)
     assert "ry_deg" in limits.assumed
 
 
+@pytest.mark.slow
 def test_a_time_limit_leaves_out_the_least_useful_views(small_scanner):
     free = plan_part_scan(setting(small_scanner))
     limits = ScanLimits(time=type(ScanLimits().time)(limit=0.6 * free.chosen.duration))
@@ -317,6 +320,7 @@ def hexapod(limits: tuple[float, float]) -> Hexapod:
     return Hexapod(**joints, leg_limits=limits)
 
 
+@pytest.mark.slow
 def test_a_continuous_scan_is_one_smooth_turn_that_fdk_follows(small_scanner):
     plan = plan_part_scan(setting(small_scanner, views=24, continuous=True))
     assert path_obstacle(plan.matrices) == ""
@@ -332,6 +336,7 @@ def test_a_continuous_scan_is_one_smooth_turn_that_fdk_follows(small_scanner):
     assert path_obstacle(scattered.matrices) != ""
 
 
+@pytest.mark.slow
 def test_the_legs_of_a_hexapod_stay_within_their_stroke(small_scanner):
     machine = hexapod((100.0, 400.0))
     task = setting(small_scanner, manipulator=machine)

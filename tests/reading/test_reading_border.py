@@ -172,6 +172,7 @@ def test_arrays_that_claim_another_size_than_they_have(tmp_path, shape):
         read_npz(tmp_path / "a.npz", "thing")
 
 
+@pytest.mark.slow
 def test_a_zip_that_swells_is_refused_before_it_is_unpacked(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_BZIP2) as archive:
         archive.writestr("P.npy", npy((40 * 2**20,), b"\0" * (8 * 40 * 2**20)))

@@ -86,6 +86,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 """
 
 
+@pytest.mark.slow
 def test_small_files_neither_hang_nor_fill_the_memory(cases):
     bombs = sorted(p for p in (cases / "small-bombs").iterdir() if p.suffix in (".h5", ".tif"))
     assert len(bombs) == 8

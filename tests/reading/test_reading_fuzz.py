@@ -19,6 +19,7 @@ def _fuzz_path(monkeypatch):
         sys.modules.pop(name, None)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_fuzz_path")
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning")
 def test_mutants_are_read_or_refused_by_name():
@@ -31,6 +32,7 @@ def test_mutants_are_read_or_refused_by_name():
     assert [*count.foreign, *count.hangs, *count.crashes, *count.grown] == []
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_fuzz_path")
 @pytest.mark.parametrize("name", ["exports", "results"])
 def test_a_killed_writer_leaves_the_old_or_the_new_result(tmp_path, name):

@@ -60,6 +60,7 @@ def densities(volume):
     return compare(volume.values, GRID, PARTS, rays=600).inner - 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [
@@ -78,6 +79,7 @@ def test_a_displaced_panel_gives_the_right_densities_over_a_full_turn(settings):
     assert compare(volume.values, GRID, PARTS, rays=600).centre_error.max() < 0.03
 
 
+@pytest.mark.slow
 def test_a_displaced_panel_is_found_and_said():
     volume = made(matrices_of(120, width=NARROW, shift=0.25))
     assert "laterally displaced panel" in volume.settings["choice"]
@@ -86,6 +88,7 @@ def test_a_displaced_panel_is_found_and_said():
     assert "displaced" not in centred.settings["choice"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arc", [200, 210, 240, 300, 345])
 @pytest.mark.parametrize("backwards", [False, True])
 def test_a_short_scan_gives_the_right_densities(arc, backwards):
@@ -117,6 +120,7 @@ def test_the_two_weights_of_a_line_add_up_to_one(shift, arc):
     assert pairs >= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
@@ -167,6 +171,7 @@ def test_the_default_is_chosen_and_said(n, algorithm):
     assert volume.provenance.arguments["choice"] == volume.settings["choice"]
 
 
+@pytest.mark.slow
 def test_fdk_places_parts_and_densities_as_well_as_sart_after_it():
     matrices = matrices_of(72)
     images = images_of(matrices, PARTS, fine=2)
@@ -187,6 +192,7 @@ def test_a_grid_wider_than_the_field_of_view_is_said():
     assert volume.trustworthy
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", [None, "sart", "cgls"])
 def test_images_of_another_scan_are_contradicted_with_the_views_named(algorithm):
     matrices = matrices_of(48)
@@ -202,6 +208,7 @@ def test_images_of_another_scan_are_contradicted_with_the_views_named(algorithm)
     assert made(matrices, images_of(matrices, PARTS, fine=1), algorithm=algorithm).trustworthy
 
 
+@pytest.mark.slow
 def test_no_remedy_is_given_that_does_not_make_the_residual_right():
     matrices = matrices_of(48)
     images = images_of(matrices, PARTS, fine=1)

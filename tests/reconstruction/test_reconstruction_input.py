@@ -39,6 +39,7 @@ def attempt(images=IMAGES, matrices=MATRICES, grid=GRID, **settings):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("images", "message"),
     [
@@ -60,6 +61,7 @@ def test_images_that_do_not_match_are_named(images, message):
         attempt(images)
 
 
+@pytest.mark.slow
 def test_nan_pixels_are_named_or_excluded():
     broken = IMAGES.copy()
     broken[7, 20:22, 30] = np.nan
@@ -92,6 +94,7 @@ def test_what_images_are_is_never_guessed():
         attempt(-IMAGES, images_are="transmission")
 
 
+@pytest.mark.slow
 def test_counts_transmissions_and_line_integrals_agree():
     flat = np.linspace(30000, 40000, 61)[None] * np.ones((57, 1))
     expected = attempt().values
@@ -119,6 +122,7 @@ def test_volumes_out_of_view_are_refused():
         attempt(grid=VoxelGrid.cube(n=40, spacing=20.0))
 
 
+@pytest.mark.slow
 def test_too_little_memory_says_what_would_fit():
     with pytest.raises(InputError, match=r"GiB are needed for 400 x 400 x 400 voxels.*\^3 voxels would fit.*scratch"):
         attempt(grid=VoxelGrid.cube(n=400, spacing=0.015), memory_gib=0.5)
@@ -130,6 +134,7 @@ def test_too_little_memory_says_what_would_fit():
         attempt(memory_gib=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -152,6 +157,7 @@ def test_settings_are_checked(settings, message):
         attempt(**settings)
 
 
+@pytest.mark.slow
 def test_a_wrong_trajectory_leaves_a_larger_residual():
     """Without any reference part: the same images with poses off by a tilt of 1 degree, or by a lag of one view."""
     right = attempt(iterations=2).view_residual.mean()
@@ -181,6 +187,7 @@ def test_consistency_ranks_the_readings():
     assert "coarse views leave" in result.message
 
 
+@pytest.mark.slow
 def test_rings_are_taken_out():
     broken = IMAGES.copy()
     broken[:, :, 25] += 0.2
@@ -193,6 +200,7 @@ def test_rings_are_taken_out():
     assert np.sqrt(((cured - clean) ** 2).mean()) < 0.4 * np.sqrt(((ringed - clean) ** 2).mean())
 
 
+@pytest.mark.slow
 def test_options_of_the_first_version_still_work_and_say_where_they_belong():
     with pytest.warns(DeprecationWarning, match=r"relaxation=\.\.\.\) belongs to"):
         found = reconstruct(
@@ -218,6 +226,7 @@ def test_an_algorithm_has_its_own_options_only():
         attempt(algorithm=0.8)
 
 
+@pytest.mark.slow
 def test_the_coarse_check_uses_the_engine_that_reconstructs_and_refuses_nan(monkeypatch):
     scan_ = LineIntegrals(IMAGES, MATRICES, Correction(images_are="line-integrals"))
     own, plain = (check_consistency(scan_, GRID, engine="cpu", options=o) for o in ({}, {"kernels": "plain"}))

@@ -41,6 +41,7 @@ def rounding(a, b):
     return float(np.abs(a - b).max() / np.ptp(b))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{}, {"subset_size": 4, "nonnegative": True}])
 def test_slabs_on_disk_are_the_whole(settings, tmp_path):
     _z, y, x = np.meshgrid(*(np.arange(40),) * 3, indexing="ij")
@@ -95,6 +96,7 @@ class Dying:
         return IMAGES[j]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["memory", "disk"])
 @pytest.mark.parametrize("after", [BEFORE + 20, BEFORE + 60, BEFORE + 85])  # in the FDK start, in both sweeps of SART
 def test_a_killed_run_continues_to_the_same_numbers(where, after, tmp_path):
@@ -148,6 +150,7 @@ def test_killed_while_it_clears_its_checkpoint_it_ends_with_the_same_numbers(tmp
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_starts_anew_and_says_so(tmp_path):
     execution = Execution(checkpoint=tmp_path, checkpoint_seconds=0.0)
     with pytest.raises(Killed):

@@ -55,6 +55,7 @@ def truth_of(images, matrices, **settings):
     return compare(volume.values, GRID, OBJECTS), volume
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [
@@ -76,12 +77,14 @@ def test_ball_centres_on_a_tilted_path(tilted, settings):
     assert volume.provenance.arguments["algorithm"] == name_of(settings.get("algorithm", FDK()))
 
 
+@pytest.mark.slow
 def test_order_decides(tilted):
     spread, _ = truth_of(tilted[1], tilted[0], algorithm=PAPER)
     in_turn, _ = truth_of(tilted[1], tilted[0], algorithm=replace(PAPER, order="sequential"))
     assert np.abs(in_turn.inner - 1).mean() > 3 * np.abs(spread.inner - 1).mean()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ["circular", "tilted"])
 def test_fdk_follows_the_path(path, request):
     matrices, images = request.getfixturevalue(path)
@@ -106,6 +109,7 @@ def test_on_a_circle_the_path_is_crossed_twice_and_the_ramp_is_that_of_rows(circ
     np.testing.assert_allclose(by_path, by_rows, atol=1e-3 * np.abs(by_rows).max())
 
 
+@pytest.mark.slow
 def test_fdk_is_refused_where_the_height_jumps_from_view_to_view(circular):
     matrices, _ = circular
     leaning = np.tile(np.eye(4), (len(matrices), 1, 1))
@@ -118,6 +122,7 @@ def test_fdk_is_refused_where_the_height_jumps_from_view_to_view(circular):
     assert truth.centre_error.max() < 0.04
 
 
+@pytest.mark.slow
 def test_cgls_lowers_the_residual_every_time(tilted):
     residual = [
         truth_of(tilted[1], tilted[0], algorithm="cgls", iterations=k, consistency="off")[1].view_residual.mean()
@@ -134,6 +139,7 @@ def test_cgls_lowers_the_residual_every_time(tilted):
     assert plain.values[~mask].any()
 
 
+@pytest.mark.slow
 def test_nonnegative_and_mask_hold(tilted):
     _z, y, x = np.meshgrid(*(np.arange(n) for n in GRID.shape), indexing="ij")
     mask = np.hypot(x - 31.5, y - 31.5) < 30
@@ -146,6 +152,7 @@ def test_nonnegative_and_mask_hold(tilted):
     assert truth.background < plain.background
 
 
+@pytest.mark.slow
 def test_a_short_scan_is_said():
     matrices = scan(GRID, n=60, n_u=81, tilted=False, arc=np.radians(210), field=1.3)
     images = images_of(matrices, OBJECTS)
@@ -217,6 +224,7 @@ def test_polychromatic_data_become_linear():
     assert abs(middle[1] - 0.1) < 0.3 * abs(middle[0] - 0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.authority
 @pytest.mark.skipif(not rtk_availability().available, reason="itk-rtk is not installed")
 def test_rtk_projectors_give_the_same_sart(tilted):

@@ -32,6 +32,7 @@ def volume_of(scan, n, **settings):
     return reconstruct(images, matrices, grid, images_are="line-integrals", **settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [68, 78, 100])
 def test_a_wide_grid_holds_the_small_one_and_nothing_beyond(scan, n):
     small, wide = volume_of(scan, 48), volume_of(scan, n)
@@ -48,6 +49,7 @@ def test_a_wide_grid_holds_the_small_one_and_nothing_beyond(scan, n):
     assert np.array_equal(volume_of(scan, n).values, wide.values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["sart", "fdk+sart", "ossart", "cgls"])
 def test_every_algorithm_stays_within_what_the_images_hold(scan, algorithm):
     wide = volume_of(scan, 100, algorithm=algorithm)

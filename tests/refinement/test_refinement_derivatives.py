@@ -55,6 +55,7 @@ def joseph(f, P, u, v):
     return total * np.linalg.norm(d) / abs(e[axis])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vector", [True, False])
 def test_derivatives_are_those_of_the_sum_to_1e_4(vector):
     matrices, f, h = scan(), volume(), 1e-6

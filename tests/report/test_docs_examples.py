@@ -38,6 +38,7 @@ def test_matrices_mean_the_same_by_hand_and_through_a_file(tmp_path, capsys):
     assert "largest difference" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_from_radiographs_to_geometry_files(tmp_path, capsys):
     setup = demo_setup(small=True, views=36)
     run = tp.simulate_ball_run(

@@ -25,6 +25,7 @@ EXPECTED = {
 """What the printed text of each example holds."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", EXAMPLES, ids=[p.stem for p in EXAMPLES])
 def test_the_reference_s_examples_run(path, capsys):
     runpy.run_path(str(path), run_name="__main__")

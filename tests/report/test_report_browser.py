@@ -70,6 +70,7 @@ def inspect(browser, html: str, folder: Path, *, flat: int, space: int) -> Visit
     return visit
 
 
+@pytest.mark.slow
 def test_a_full_report_is_drawn(browser, sample, scan, tmp_path):
     calibration, observations, poses = sample()
     html = calibration_report(calibration, observations=observations, poses=poses, scan=scan)
@@ -77,11 +78,13 @@ def test_a_full_report_is_drawn(browser, sample, scan, tmp_path):
     assert visit.count(".point") > 5 * len(calibration.pose_id)
 
 
+@pytest.mark.slow
 def test_a_bare_report_is_drawn(browser, sample, tmp_path):
     calibration, _, _ = sample(turns=(0.0,))
     inspect(browser, calibration_report(calibration, observations=None, poses=None), tmp_path, flat=8, space=1)
 
 
+@pytest.mark.slow
 def test_the_other_reports_are_drawn(browser, sample, scan, tmp_path):
     _, observations, _ = sample()
     for name, html, flat, space in (
@@ -93,6 +96,7 @@ def test_the_other_reports_are_drawn(browser, sample, scan, tmp_path):
         inspect(browser, html, folder, flat=flat, space=space)
 
 
+@pytest.mark.slow
 def test_plots_are_drawn_when_they_are_scrolled_to(browser, sample, scan, tmp_path):
     calibration, observations, poses = sample()
     html = calibration_report(calibration, observations=observations, poses=poses, scan=scan)
@@ -105,6 +109,7 @@ def test_plots_are_drawn_when_they_are_scrolled_to(browser, sample, scan, tmp_pa
     assert visit.drawn > before
 
 
+@pytest.mark.slow
 def test_a_page_that_tries_to_load_is_noticed_and_stopped(browser, sample, tmp_path):
     """The checks above can fail: a smuggled address is refused by the page's policy, and seen where there is none."""
     _, observations, _ = sample()
@@ -115,6 +120,7 @@ def test_a_page_that_tries_to_load_is_noticed_and_stopped(browser, sample, tmp_p
     assert "http://192.0.2.1/x.png" in opened.requests
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_the_report_is_accessible(browser, sample, scan, tmp_path, scheme):
     calibration, observations, poses = sample(verdict="doubtful")
@@ -124,6 +130,7 @@ def test_the_report_is_accessible(browser, sample, scan, tmp_path, scheme):
     assert violations(visit.page) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [360, 700, 1400])
 def test_nothing_is_wider_than_the_window(browser, sample, scan, tmp_path, width):
     calibration, observations, poses = sample()
@@ -137,6 +144,7 @@ def test_nothing_is_wider_than_the_window(browser, sample, scan, tmp_path, width
         assert not any(tables.nth(k).evaluate(wide) for k in range(tables.count()))
 
 
+@pytest.mark.slow
 def test_a_table_is_sorted_by_the_keyboard(browser, sample, tmp_path):
     _, observations, _ = sample()
     visit = Visit(browser, observations_report(observations), tmp_path)
@@ -153,6 +161,7 @@ def test_a_table_is_sorted_by_the_keyboard(browser, sample, tmp_path):
         assert (sign * np.diff(values) >= 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("low", "high", "labels", "note"),
     [

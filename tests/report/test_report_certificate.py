@@ -122,6 +122,7 @@ def test_what_cannot_be_determined_has_no_number(certificate):
     assert "nan" not in re.sub(r"<dcc:content>.*?</dcc:content>", "", text)
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_a_report_is_printed_as_pdf(certificate, tmp_path):
     from browser import chromium_path

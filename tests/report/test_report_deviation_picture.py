@@ -35,6 +35,7 @@ def picture(values: np.ndarray) -> np.ndarray:
     return drawn(POINTS, FACES, NORMALS, values, range_um=20.0, R=ABOVE, px_per_mm=2.0, size_mm=(16.0, 14.0))
 
 
+@pytest.mark.slow
 def test_the_near_square_hides_the_far_one_and_has_its_colour():
     values = np.array([10.0] * 4 + [-20.0] * 4)
     found = picture(values)

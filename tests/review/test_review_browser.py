@@ -76,6 +76,7 @@ def settled(page) -> None:
     page.wait_for_selector("body[data-busy='0']", state="attached", timeout=600_000)
 
 
+@pytest.mark.slow
 def test_a_person_finds_every_spoilt_detection_by_keyboard_alone(browser, address, project):
     page = visit(browser, address)
     for _ in range(200):
@@ -97,6 +98,7 @@ def test_a_person_finds_every_spoilt_detection_by_keyboard_alone(browser, addres
     assert report.count("N. Sato") >= 200
 
 
+@pytest.mark.slow
 def test_undo_move_start_and_reasons_work_by_keyboard(browser, address, project):
     page = visit(browser, address)
     names = page.locator("#rows .name").all_inner_texts()
@@ -127,6 +129,7 @@ def test_undo_move_start_and_reasons_work_by_keyboard(browser, address, project)
     assert page.said == []
 
 
+@pytest.mark.slow
 def test_the_radiograph_is_shown_with_what_was_found(browser, address):
     page = visit(browser, address)
     for _ in range(100):
@@ -141,6 +144,7 @@ def test_the_radiograph_is_shown_with_what_was_found(browser, address):
     assert min(colours) > 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "scheme"), [(1400, "light"), (1400, "dark"), (380, "light")])
 def test_the_page_is_accessible_and_fits(browser, address, width, scheme):
     page = visit(browser, address, width=width, scheme=scheme)
@@ -153,6 +157,7 @@ def test_the_page_is_accessible_and_fits(browser, address, width, scheme):
     assert page.said == []
 
 
+@pytest.mark.slow
 def test_the_address_without_its_token_shows_nothing(browser, address):
     page = browser.new_page()
     answer = page.goto(address.rsplit("/", 2)[0] + "/")
@@ -160,6 +165,7 @@ def test_the_address_without_its_token_shows_nothing(browser, address):
     assert "token" in page.inner_text("body")
 
 
+@pytest.mark.slow
 def test_nothing_of_the_reviewed_folder_is_changed(browser, address, project: Path):
     before = {p.name: p.read_bytes() for p in project.cal.iterdir() if p.is_file()}
     page = visit(browser, address)

@@ -35,6 +35,7 @@ def run():
     return replace(made, t=None, ball_diameter=None, spot=FocalSpot(shape="gaussian", size_u=0.05, size_v=0.05))
 
 
+@pytest.mark.slow
 def test_there_and_back(run, tmp_path):
     content, files = run_to_ctsimu(run)
     for name, mesh in files.items():

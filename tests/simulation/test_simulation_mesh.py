@@ -63,6 +63,7 @@ def aimed(rng, n, reach):
     return o, target - o
 
 
+@pytest.mark.slow
 def test_a_ball_of_131k_triangles_against_the_analytic_one(rng):
     mesh = ball(7)
     assert len(mesh.faces) == 131072
@@ -136,6 +137,7 @@ def test_rays_through_corners_of_a_mesh_never_slip_through():
     assert ((on_rim == 0) | (on_rim > 1.9)).all()
 
 
+@pytest.mark.slow
 def test_the_edge_of_a_mesh_lies_where_the_shape_s_does():
     scanner = Scanner(d_SD=800.0, d_SR=200.0, p_u=0.4, p_v=0.5, u_0=61.3, v_0=48.7, n_u=121, n_v=97)
     mount = RigidTransform.from_angles([0.1, 0.2, 3.0], [0.2, 0.1, 0.3], source=Frame.H, target=Frame.T)

@@ -46,6 +46,7 @@ def rays(rng, n=150):
     return o, d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_paths_are_what_counting_along_the_ray_gives(name, rng):
     shape, inside = CASES[name]

@@ -52,6 +52,7 @@ def oversampling():
     return module
 
 
+@pytest.mark.slow
 def test_centre_and_edge_against_oversampling(oversampling):
     run = bare_ball(blur_sigma=0.7)
     T = transmission(run, 1)
@@ -117,6 +118,7 @@ def test_the_same_bytes_from_any_worker_and_thread():
         run.image(2)
 
 
+@pytest.mark.slow
 def test_a_sampled_spot_blurs_as_the_convolved_one_does():
     run = bare_ball(blur_sigma=0.6, cells=2)
     size = 0.15

@@ -49,6 +49,7 @@ def test_the_examples_describe_the_paper_s_runs(name, frames):
     assert run.scanner.n_u == (1024 if name == "standard-3d" else 2048)
 
 
+@pytest.mark.slow
 def test_the_small_example_uses_most_keys_and_is_the_same_everywhere():
     pytest.importorskip("xraydb")
     run = simulate(read_scene(SCENES / "small.toml"))

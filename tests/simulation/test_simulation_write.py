@@ -108,6 +108,7 @@ def changed_runs(run):
     yield "motion", replace(run, motion=replace(run.motion, alpha=1e-6))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["tiff", "hdf5"])
 def test_a_changed_scene_starts_anew_and_equals_a_fresh_run(run, tmp_path, form):
     for number, (words, other) in enumerate(changed_runs(run)):
@@ -174,6 +175,7 @@ write_run(Path(sys.argv[1]), simulate(scene_from(SCENE)), form="hdf5",
 """
 
 
+@pytest.mark.slow
 def test_every_finished_frame_outlives_a_kill(run, tmp_path):
     ended = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path / "a"), str(Path(__file__).parent)], check=False)
     assert ended.returncode == -9
@@ -201,6 +203,7 @@ except FileError as error:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bytes_there", [20_000, 35_000])
 def test_a_disk_without_room_for_the_stack_is_an_error(tmp_path, bytes_there):
     command = [sys.executable, "-c", FULL, str(tmp_path / "a"), str(Path(__file__).parent), str(bytes_there)]

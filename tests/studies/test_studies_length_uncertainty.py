@@ -130,6 +130,7 @@ def test_a_distance_of_planes_has_the_share_of_the_points_between_them(run, cali
     assert found == pytest.approx(float(length_sigma(calibration, run.poses, *ends)[0]), rel=0.05)
 
 
+@pytest.mark.slow
 def test_virtual_scans_with_drawn_calibrations_scatter_as_the_covariance_says(run, calibration):
     """No noise: only the calibration that is believed differs between the scans, here with d_SR uncertain too."""
     wide = replace(
@@ -191,12 +192,14 @@ def test_drawn_errors_of_a_manipulator_scatter_as_their_covariance_says(run, kin
     assert np.abs(found.mean(axis=1) - BALLS.mean(axis=0)).max() < 0.05 * VOXEL
 
 
+@pytest.mark.slow
 def test_virtual_scans_draw_the_errors_of_a_manipulator(run, kinematic):
     found = simulated_errors(run, plan(), tp.VoxelGrid.cube(n=SIZE, spacing=VOXEL), draws=3, calibration=kinematic)
     assert found["SD"].with_calibration
     assert 0 < found["SD"].u < 0.05 * VOXEL
 
 
+@pytest.mark.slow
 def test_a_scene_whose_manipulator_errs_is_taken_to_be_where_the_calibration_puts_it(run, kinematic):
     """Identified errors are undone; without them the balls come out smeared and elsewhere."""
     machine = PoseMap(order=1, t_scale=1.0)
@@ -215,6 +218,7 @@ def test_a_scene_whose_manipulator_errs_is_taken_to_be_where_the_calibration_put
     assert np.abs(ignored - ideal).max() > 0.3 * ideal.max()
 
 
+@pytest.mark.slow
 def test_draws_lie_elsewhere_and_differ_in_size_by_voxels(run):
     """Relative places of the two ends of a length within their voxels are drawn too; the part in mm stays."""
     grid = tp.VoxelGrid.cube(n=SIZE, spacing=VOXEL)
@@ -231,6 +235,7 @@ def test_draws_lie_elsewhere_and_differ_in_size_by_voxels(run):
             assert found[f"ball {k}"].point == pytest.approx(ball, abs=0.01 * VOXEL)
 
 
+@pytest.mark.slow
 def test_virtual_scans_scatter_by_noise_and_repeat():
     noisy = tp.simulate(scene(120.0))
     grid = tp.VoxelGrid.cube(n=SIZE, spacing=VOXEL)

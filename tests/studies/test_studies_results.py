@@ -58,6 +58,7 @@ def test_every_study_names_itself():
         assert module.NOTES
 
 
+@pytest.mark.slow
 def test_radiographs_are_measured_both_ways_and_resumed(tmp_path):
     run = table1.ball_run(2.7, 2, 7)
     run = replace(run, poses=run.poses.select([0, 20]), T_MH=run.T_MH[[0, 20]])
@@ -157,6 +158,7 @@ def test_the_repeat_at_90_degrees_has_the_residuals_of_y_about_x():
     assert 0.7 < c["x"] < 1.2
 
 
+@pytest.mark.slow
 def test_the_virtual_hexapod_leaves_the_printed_residuals(monkeypatch):
     def from_truth(run, steps, name, progress):
         return measured_from_truth(run, 3)
@@ -188,6 +190,7 @@ def tuy():
     return run_study("tuy")
 
 
+@pytest.mark.slow
 def test_source_paths_and_completeness_hold(tmp_path, tuy):
     for result in (run_study("figure9", folder=tmp_path), tuy):
         assert result.holds, [c for c in result.checks if not c.holds]
@@ -213,6 +216,7 @@ def test_a_source_and_detector_that_move_are_corrected_too():
     assert found["best"] < 3 * found["u"]
 
 
+@pytest.mark.slow
 def test_files_are_written_once(tmp_path, tuy):
     write_study(tmp_path, tuy)
     content = json.loads((tmp_path / "study.json").read_text())
@@ -227,6 +231,7 @@ def test_files_are_written_once(tmp_path, tuy):
         write_study(tmp_path, tuy)
 
 
+@pytest.mark.slow
 def test_pages_say_what_does_not_hold(tmp_path, tuy):
     failed = StudyCheck(statement="the moon is made of cheese", found="rock", holds=False)
     write_study(tmp_path, replace(tuy, checks=(*tuy.checks, failed)))
@@ -250,6 +255,7 @@ def call(*words: str) -> int:
     return typer.main.get_command(app).main(args=list(words), standalone_mode=False) or 0
 
 
+@pytest.mark.slow
 def test_the_command_line_runs_a_study(tmp_path, capsys):
     assert call("study", "figure9", "--out", str(tmp_path / "out"), "--json") == 0
     said = json.loads(capsys.readouterr().out)

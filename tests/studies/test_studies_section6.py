@@ -84,6 +84,7 @@ def test_a_mirrored_view_has_the_same_paths():
     np.testing.assert_allclose(found[1][:, ::-1], found[0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_paths_through_balls_on_shafts_are_those_of_the_solids():
     solids = compile_solids(multi_sphere_standard(base=False))
     bottom = np.full(27, BASE_TOP)
@@ -226,6 +227,7 @@ def test_cases_have_names_of_their_own_and_order_is_looked_at_once():
     assert [c.order for c in cases if c.order] == ["sequential", "golden"]
 
 
+@pytest.mark.slow
 def test_a_tiny_run_continues_where_it_stopped(tmp_path, monkeypatch):
     steps = Steps(folder=tmp_path, key={"study": "section6"})
     solved: dict[tuple[float, int], object] = {}
