@@ -95,6 +95,7 @@ def test_blocks_nest_four_deep_at_most():
     assert deep == {}
 
 
+@pytest.mark.slow
 def test_few_parameters_are_typed_any():
     said_nothing = [
         f"{name}({a.arg})"

@@ -128,6 +128,7 @@ def _understated(poses, seed):
     return BallObservations.from_sigma(observed.x_D, 0.015, pose_id=poses.pose_id)
 
 
+@pytest.mark.slow
 def test_draws_repeat_and_do_not_depend_on_threads():
     import numba
 

@@ -93,6 +93,7 @@ def test_errors_of_both_robots_are_found(twins: TwinExperiment, tmp_path: Path) 
         projection_matrices(again, e.scan)
 
 
+@pytest.mark.slow
 def test_distance_of_every_view(twins: TwinExperiment) -> None:
     """d_SD and the piercing point follow from the poses of both robots."""
     e = twins

@@ -252,6 +252,7 @@ def test_one_more_number_a_view(gantry, scanner, rng):
     assert own > 0.05, f"half a millimetre of d_SD moves points {r:.0f} px from the middle"
 
 
+@pytest.mark.slow
 def test_a_c_arm_with_a_lift(gantry, scanner, rng, capsys):
     """A C-arm of one sliding and two turning joints, by joint values alone."""
     from tomopose.studies.improvements import c_arm
@@ -429,6 +430,7 @@ def test_a_pitch_may_be_freed_and_the_mount_takes_the_rest(twins, capsys):
         assert told in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_matrices_need_the_tables_of_their_arrangement(twins, capsys):
     folder, _ = twins
     assert calibrate(folder, "cal", *twin_words(folder, "--model", "rigid")) == 0

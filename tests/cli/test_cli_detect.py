@@ -58,6 +58,7 @@ def test_detect_writes_a_row_for_each_radiograph_and_names_the_missing_flat_fiel
     assert found.seen.all()
 
 
+@pytest.mark.slow
 def test_diameter_that_contradicts_the_calibration_stops_before_anything_is_written(radiographs, tmp_path, capsys):
     wrong = tmp_path / "wrong"
     assert run(words(radiographs, "calibrate", wrong, "--ball-diameter-mm", "7.6", "--quiet")) == 1

@@ -85,6 +85,7 @@ def test_radiographs_of_a_standard_become_matrices_of_their_path(scan, capsys):
     assert "What the manipulator does beside its table" in page
 
 
+@pytest.mark.slow
 def test_an_image_without_the_standard_ends_with_exit_3_and_its_name(scan, tmp_path):
     folder, _ = scan
     blank = tmp_path / "images"

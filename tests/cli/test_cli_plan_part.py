@@ -86,6 +86,7 @@ def test_a_material_is_looked_up_and_the_assumed_voltage_is_said(words, tmp_path
     assert 0.03 < mu < 0.2
 
 
+@pytest.mark.slow
 def test_a_placing_is_stated_and_never_worse_than_as_given(words, tmp_path):
     assert run([*words, "--mu-per-mm", "0.05", "--views", "4", "--placing", "--quiet"]) == 0
     placing = json.loads((tmp_path / "scan.json").read_text())["placing"]
@@ -95,6 +96,7 @@ def test_a_placing_is_stated_and_never_worse_than_as_given(words, tmp_path):
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "code", "match"),
     [

@@ -85,6 +85,7 @@ def nexus(path, made):
         file["entry/sample/rotation_angle"].attrs["units"] = "degree"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", ["PI", "KUKA", "Nikon and csv", "NXtomo"])
 def test_two_commands_lead_from_the_files_that_people_have_to_a_report(start, made, tmp_path, monkeypatch, capsys):
     """None of them has more than four options."""

@@ -106,6 +106,7 @@ def test_cgls_refuses_what_it_does_not_serve(scan, capsys):
     assert "checkpoint" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_middle_of_the_volume_may_lie_anywhere(scan):
     assert run(words(scan, "--images-are", "transmission", "--centre-mm", "3,-2,1.5", "--quiet")) == 0
     volume = tp.read_volume(scan / "volume.h5")
@@ -166,6 +167,7 @@ def test_beam_hardening_of_a_known_material_is_taken_out(scan, capsys):
     assert "--scene" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_voxels_may_have_three_sides(scan, capsys):
     more = ["--voxel-mm", "0.6,0.6,0.9", "--size", "45,45,30", "--images-are", "transmission", "--json"]
     given = ["reconstruct", "--matrices", scan / "matrices.npz", "--images", scan / "scan", "--out", scan / "volume.h5"]
@@ -207,6 +209,7 @@ def test_options_that_contradict_one_another_are_usage_errors(scan, more, option
     assert not (scan / "volume.h5").exists()
 
 
+@pytest.mark.slow
 def test_the_paper_may_be_said_twice(scan, capsys):
     more = ["--paper", "--relaxation", "0.8", "--algorithm", "sart", "--seed", "3", "--json"]
     assert run(words(scan, "--images-are", "transmission", *more)) == 0

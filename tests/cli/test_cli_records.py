@@ -69,6 +69,7 @@ def test_a_changed_scanner_file_is_named_first_and_the_mount_is_not_tested(files
     assert "different scanners" in (files.folder / "change.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_a_history_grows_once_for_each_run_and_answers_first(files, days, capsys):
     history, page = files.folder / "history.jsonl", files.folder / "history.html"
     paths = [days(f"d{k}", k) for k in range(4)]

@@ -136,6 +136,7 @@ def test_no_flat_field(scene: Scene, clean: Array) -> None:
     assert found.status == "ok"
 
 
+@pytest.mark.slow
 def test_pixels_without_a_flat_field(scene: Scene, good: np.ndarray) -> None:
     """Where the flat image is no brighter than the dark one, transmission does not exist: left out, or refused."""
     transmission = good / np.float32(WHITE)

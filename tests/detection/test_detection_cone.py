@@ -109,6 +109,7 @@ def test_derivatives_of_the_profiles(kappa: float) -> None:
         assert table[inner, 7] == pytest.approx(by_kappa[inner], abs=2e-4)
 
 
+@pytest.mark.slow
 def test_simulation_and_model_agree_without_noise_and_holder(tilted: Scanner) -> None:
     """Two independent computations of a blurred silhouette: the centre agrees to 0.0002 px, the radius to 0.002 px."""
     for pixel in ((301.3, 850.9), (700.55, 611.25)):

@@ -57,6 +57,7 @@ def same(a: BallObservations, b: BallObservations) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_rows_and_progress(run: tuple[Scanner, list[np.ndarray], np.ndarray]) -> None:
     scanner, images, truth = run
     calls: list[tuple[int, int]] = []

@@ -87,6 +87,7 @@ def test_every_ball_is_found_and_none_is_wrong(images: list[Array], observations
     assert np.sum(np.abs(difference).max(axis=1) < CLEAR_TOLERANCE) >= CLEAR
 
 
+@pytest.mark.slow
 def test_rows_say_what_the_images_are(observations: BallObservations) -> None:
     assert all("bright ball" in s for s in observations.status or ())
     assert observations.sigma.max() < 0.2

@@ -29,6 +29,7 @@ def gvxr(shared_data: Path) -> tuple[BallObservations, Array, Array]:
     return observations, truth, ellipse
 
 
+@pytest.mark.slow
 def test_centres_within_a_thousandth_of_a_pixel(gvxr: tuple[BallObservations, Array, Array]) -> None:
     observations, truth, _ = gvxr
     assert observations.seen.all()

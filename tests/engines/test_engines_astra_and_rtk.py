@@ -108,6 +108,7 @@ def test_rtk_projects_alike_away_from_the_outer_faces(rng):
     assert abs(left / right - 1) < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.authority
 @pytest.mark.skipif(not rtk.availability().available, reason="itk-rtk is not installed")
 def test_rtk_counts_its_views():

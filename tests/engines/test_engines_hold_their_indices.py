@@ -121,6 +121,7 @@ def guarded(values: np.ndarray) -> np.ndarray:
     return room[GUARD:-GUARD]
 
 
+@pytest.mark.slow
 @settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(scene=scenes(), vector=st.booleans(), inverse_square=st.booleans())
 def test_nothing_is_read_beyond_an_array(scene, vector, inverse_square):

@@ -14,6 +14,7 @@ X = points(m=8)
 QUICK = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", ["bottom", "top"])
 @given(matrices=geometries())
 @QUICK

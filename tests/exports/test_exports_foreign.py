@@ -212,6 +212,7 @@ def scenarios():
     return sorted(Path(ctsimu.__path__[0]).glob("evaluation/scenarios/*.json"))
 
 
+@pytest.mark.slow
 def test_the_nine_scenarios_of_ctsimu_give_its_own_matrices():
     from ctsimu.scenario import Scenario
 

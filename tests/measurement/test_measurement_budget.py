@@ -80,6 +80,7 @@ def test_a_scan_noisier_than_the_virtual_ones_is_said_to_be_so():
     assert among_repeats.u == pytest.approx(math.sqrt(0.001**2 * (1 + 1 / 20) + 0.004**2 - 0.001**2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runs", [3, 5, 20, 100])
 def test_the_interval_of_a_simulation_holds_95_percent_whatever_the_number_of_draws(runs):
     """Errors of scans and draws from one normal law: a bias and a scatter that the fit does not know in full."""
@@ -141,6 +142,7 @@ def test_the_intervals_of_repeats_hold_95_percent_whatever_their_number(n):
     assert np.mean(mean) == pytest.approx(0.95, abs=SLACK)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bias", [0.0, 0.002, 0.02])
 @pytest.mark.parametrize("n", [2, 3, 5, 20])
 def test_the_interval_with_a_calibrated_reference_holds_at_least_95_percent(n, bias):

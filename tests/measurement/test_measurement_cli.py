@@ -21,6 +21,8 @@ from tomopose.io.volume_files import write_volume
 from tomopose.measurement.mesh.mesh import Mesh
 from tomopose.trajectory.tilt import eq11_triangle
 
+pytestmark = pytest.mark.slow  # its scans alone take ten seconds
+
 REPEATS = """
 [repeats]
 "3D scan" = ["one", "two"]
@@ -68,7 +70,6 @@ def measured(folder):
     return out
 
 
-@pytest.mark.slow
 def test_the_summary(folder, capsys):
     out = folder / "summary"
     assert run(folder / "plan.toml", "--volume", folder / "scan1.h5", "--out", out, "--json") == 0
@@ -105,7 +106,6 @@ def test_what_cannot_be_decided_is_not_said_to_conform(folder, capsys):
     assert "ithin limits" not in page
 
 
-@pytest.mark.slow
 def test_the_report_shows_groups_side_by_side_and_the_comparison(measured):
     page = (measured / "report.html").read_text(encoding="utf-8")
     for words in (
@@ -171,7 +171,6 @@ def test_the_picture_shows_the_part_in_the_colours_of_the_map(measured):
     assert np.mean(np.abs(hue - middle / middle.sum()).max(axis=1) < 0.03) > 0.5
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("between", ["cells", "natural"])
 def test_a_coarse_reference_is_refined_fitted_and_corrected(folder, between):
     """A reference of twelve triangles; a measuring machine found its top 10 um higher than nominal."""
@@ -214,7 +213,6 @@ def test_a_coarse_reference_is_refined_fitted_and_corrected(folder, between):
     assert summary["best_fit_moved_mm"] == pytest.approx(np.linalg.norm([0.02, -0.01, -0.01]), abs=0.01)
 
 
-@pytest.mark.slow
 def test_a_calibration_adds_its_share(folder):
     scanner = tp.Scanner(d_SD=900.0, d_SR=200.0, p_u=0.6, p_v=0.63, u_0=29.3, v_0=31.1, n_u=60, n_v=63)
     T_HT = tp.RigidTransform.from_angles([0.01, 0.0, 3.1], [0.2, -0.1, 0.3], source=tp.Frame.H, target=tp.Frame.T)
@@ -292,7 +290,6 @@ tilt = "triangle"
 """
 
 
-@pytest.mark.slow
 def test_virtual_scans_from_the_command_line(folder):
     (folder / "scene.toml").write_text(SCENE, encoding="utf-8")
     plan = (
@@ -355,7 +352,7 @@ class TestRefused:
         with pytest.raises(FileError, match="does not exist"):
             run(folder / "plan.toml", "--volume", folder / "none.h5", "--out", folder / "third")
 
-    @pytest.mark.parametrize(
+        @pytest.mark.parametrize(
         ("file", "error", "words"),
         [
             ("metres.stl", UnitError, "metres"),

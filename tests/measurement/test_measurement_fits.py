@@ -28,6 +28,7 @@ FITS = {
 RUNS = 300
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", FITS)
 def test_the_covariance_is_that_of_repeated_fits(kind):
     """Noise along the normals, many times: spread of every parameter over its stated uncertainty."""
@@ -44,6 +45,7 @@ def test_the_covariance_is_that_of_repeated_fits(kind):
     assert np.sqrt(spread[fixed] / stated[fixed]) == pytest.approx(np.ones(fixed.sum()), abs=4 / np.sqrt(2 * RUNS))
 
 
+@pytest.mark.slow
 def test_the_covariance_of_lines_and_circles():
     rng = np.random.default_rng(2)
     t = np.linspace(-2, 3, 40)

@@ -110,6 +110,7 @@ def plan():
     return plan_from(tomllib.loads(PLAN))
 
 
+@pytest.mark.slow
 def test_a_clean_block(plan):
     found = measure(block(), plan)
     by_name = {r.name: r for r in found.results}
@@ -236,6 +237,7 @@ def test_a_straightness_is_signed_along_the_probed_normal(document):
 
 
 class TestStatedTerms:
+    @pytest.mark.slow
     def test_what_no_scan_shows_is_stated_and_added(self, document):
         document["uncertainty"] = {"u_workpiece_mm": 0.0004, "u_drift_mm": 0.0002, "u_temperature_K": 0.5}
         document["expansion_per_K"] = 23e-6
@@ -260,6 +262,7 @@ class TestStatedTerms:
         document["measurands"][0]["calibrated_mm"] = 3.9
         assert measure(block(), plan_from(document)).out_of_limits[0].name == "L1"
 
+    @pytest.mark.slow
     def test_a_form_needs_no_nominal_value_to_be_judged(self, document):
         del document["measurands"][2]["nominal_mm"]
         found = measure(block(), plan_from(document))
@@ -272,6 +275,7 @@ def test_volumes_are_no_repeats_unless_the_plan_says_so(plan):
     assert found.repeats() == ()
 
 
+@pytest.mark.slow
 def test_the_transform_of_each_volume_is_reported(plan):
     found = measure(block(), plan)
     alignment = found.alignments["volume"]
@@ -291,6 +295,7 @@ def turned_block(turn, shift):
     return as_volume(values, grid)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["datum", "best-fit"])
 def test_a_turned_part_is_found_by_datums_and_by_best_fit(document, kind):
     turn, shift = exp_rotation(np.array([0.012, -0.009, 0.015])), np.array([0.03, -0.02, 0.04])
@@ -399,6 +404,7 @@ def test_the_same_numbers_twice(plan):
     assert [r.value for r in one.results] == [r.value for r in two.results]
 
 
+@pytest.mark.slow
 def test_expansion_to_twenty_degrees(document):
     document["temperature_C"], document["expansion_per_K"] = 30.0, 23e-6
     found = measure(block(), plan_from(document))
@@ -444,6 +450,7 @@ class TestBadPlans:
         with pytest.raises(InputError, match="probed"):
             plan_from(document)
 
+    @pytest.mark.slow
     def test_a_line_whose_normal_runs_along_it(self, document):
         document["features"]["l"] = {
             "kind": "line",
@@ -520,6 +527,7 @@ class TestBadPlans:
         with pytest.raises(InputError, match="leaves nothing"):
             measure(block(), plan_from(document))
 
+    @pytest.mark.slow
     def test_a_measurand_that_a_feature_does_not_have(self, document):
         document["measurands"] = [{"name": "D", "kind": "diameter", "of": ["top"]}]
         with pytest.raises(InputError, match="no radius"):

@@ -139,6 +139,7 @@ def test_a_plan_without_spheres_or_with_a_corrected_scale_has_no_protocol():
         acceptance_protocol(results_of(plan_from(document())), plan_from(document()), "other")
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_protocol_and_ends_with_3_where_a_limit_is_exceeded(tmp_path, capsys):
     """Seven balls in closed form with a blur of one voxel, which takes 2 sigma^2 / R off each diameter."""
     rng = np.random.default_rng(2)

@@ -71,6 +71,7 @@ def plan(calibrated, **changes):
     )
 
 
+@pytest.mark.slow
 def test_the_whole_standard(standard):
     volume, calibrated = standard
     found = measure(volume, plan(calibrated))
@@ -88,6 +89,7 @@ def test_the_whole_standard(standard):
     assert found.scale["volume"] == 1.0
 
 
+@pytest.mark.slow
 def test_the_scale_correction_is_switched_on_and_reported(standard):
     volume, calibrated = standard
     found = measure(volume, plan(calibrated * 1.002, scale_correction=True))

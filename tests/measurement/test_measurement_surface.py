@@ -76,6 +76,7 @@ def test_the_correction_removes_the_curvature_bias_and_says_so(balls, clean):
     assert found.settings["curvature_correction"] is True
 
 
+@pytest.mark.slow
 def test_drift_spoils_the_fixed_level_but_not_the_local_edge(balls, drifting):
     grid, centres = balls
     fixed = errors(surface(drifting, method="iso-50"), grid, centres)[1]
@@ -84,6 +85,7 @@ def test_drift_spoils_the_fixed_level_but_not_the_local_edge(balls, drifting):
     assert np.std(local) < 0.006
 
 
+@pytest.mark.slow
 def test_shared_plateaus_scatter_less_than_a_fixed_level_where_grey_drifts(balls, drifting):
     """D95 of the balls, mean: quieter than ISO-50, and than edges with plateaus of their own."""
     _, centres = balls
@@ -177,12 +179,14 @@ def test_sharing_plateaus_leaves_the_rim_of_a_face_where_it_is():
     assert np.abs(found.edges.offset[found.good]).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_the_local_half_agrees_with_the_fitted_step_on_clean_data(balls, clean):
     grid, centres = balls
     half, step = (errors(surface(clean, method=m), grid, centres) for m in ("local-50", "esf"))
     assert half[1] == pytest.approx(step[1], abs=2e-3)
 
 
+@pytest.mark.slow
 def test_slabs_change_memory_not_result(clean):
     whole, slabs = surface(clean, layers=500), surface(clean, layers=17)
     assert len(whole) == len(slabs)
@@ -212,6 +216,7 @@ def test_axes_are_not_mixed_up_with_voxels_of_three_sizes():
     assert fit.radius == pytest.approx(1.6 - 0.13**2 / 1.6, abs=3e-4)
 
 
+@pytest.mark.slow
 def test_two_materials_give_two_surfaces():
     grid = grid_of(60, 0.1, (0, 0, 0))
     values = 0.5 * balls_volume(grid, [[0, 0, 0]], [2.2], 0.1) + 0.5 * balls_volume(grid, [[0, 0, 0]], [1.2], 0.1)

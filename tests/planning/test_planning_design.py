@@ -52,6 +52,7 @@ def test_thirty_images_with_two_table_angles_match_the_paper_grid(turned_plan):
     assert len(turned_plan) <= 30
 
 
+@pytest.mark.slow
 def test_all_but_the_true_symmetries_are_resolved(turned_plan):
     assert turned_plan.resolved.unresolved == ()
     assert {h.name for h in turned_plan.resolved.symmetric} == {

@@ -354,6 +354,7 @@ def test_the_legs_of_a_hexapod_stay_within_their_stroke(small_scanner):
         plan_part_scan(setting(small_scanner, manipulator=hexapod((10.0, 20.0))))
 
 
+@pytest.mark.slow
 def test_every_view_keeps_to_the_least_transmission_that_is_asked_for(small_scanner):
     task = setting(small_scanner)
     goal = task.goal()

@@ -145,6 +145,7 @@ def test_everything_else_is_refused_by_name(settings, words, algorithm):
     assert np.isfinite(volume.values).all()
 
 
+@pytest.mark.slow
 def test_a_turn_with_two_holes_is_refused_by_name():
     whole = matrices_of(180)
     matrices = whole.select([j for j in range(180) if not (20 <= j < 50 or 110 <= j < 140)])
@@ -162,6 +163,7 @@ def test_one_and_two_views_are_said(n, words):
     assert volume.values.min() > -0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "algorithm"), [(120, "fdk"), (36, "fdk"), (24, "fdk+sart"), (12, "sart")])
 def test_the_default_is_chosen_and_said(n, algorithm):
     volume = made(matrices_of(n))

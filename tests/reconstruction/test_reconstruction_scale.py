@@ -118,6 +118,7 @@ def test_a_killed_run_continues_to_the_same_numbers(where, after, tmp_path):
     assert not (tmp_path / "state" / "state.json").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("other", "named"), [({"relaxation": 0.5}, "algorithm"), ({"images": "brighter"}, "images")])
 def test_another_reconstruction_starts_anew_and_says_so(other, named, tmp_path):
     """Never a mixture: other settings, or one pixel of one image, are another reconstruction."""
@@ -134,6 +135,7 @@ def test_another_reconstruction_starts_anew_and_says_so(other, named, tmp_path):
     assert np.array_equal(found.values, expected.values)
 
 
+@pytest.mark.slow
 def test_killed_while_it_clears_its_checkpoint_it_ends_with_the_same_numbers(tmp_path, monkeypatch):
     execution = Execution(checkpoint=tmp_path, checkpoint_seconds=0.0)
     expected = run()
@@ -177,6 +179,7 @@ def test_what_travels_to_a_cluster_survives_the_journey():
     assert np.array_equal(piece.values(), here.values())
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
 def test_a_cluster_is_the_whole():
     distributed = pytest.importorskip("distributed")

@@ -253,6 +253,7 @@ def test_rtk_projectors_give_the_same_sart(tilted):
     assert np.sqrt(((own.values - other.values) ** 2).mean()) < 1e-3 * span
 
 
+@pytest.mark.slow
 @pytest.mark.authority
 @pytest.mark.skipif(not rtk_availability().available, reason="itk-rtk is not installed")
 @pytest.mark.parametrize("weight", ["sum", "mean", "inverse-square"])

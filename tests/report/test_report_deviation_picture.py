@@ -55,6 +55,7 @@ def test_a_viewpoint_is_a_rotation_with_z_up():
     assert R[1, 2] > 0
 
 
+@pytest.mark.slow
 def test_what_was_not_measured_is_grey_unless_a_neighbour_was():
     grey = picture(np.full(8, np.nan))[14, 16].astype(float)
     np.testing.assert_allclose(grey / grey[0], np.array(NOT_MEASURED) / NOT_MEASURED[0], atol=0.02)

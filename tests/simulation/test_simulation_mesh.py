@@ -76,6 +76,7 @@ def test_a_ball_of_131k_triangles_against_the_analytic_one(rng):
     assert np.abs(error).max() < 2 * np.sqrt(2 * 2.5 * 2 * sagitta)
 
 
+@pytest.mark.slow
 def test_rays_through_edges_and_corners_of_a_cube(rng):
     o = np.array([50.0, 0.0, 0.0])
     inside = np.array([[0, 0, 0], [0, 0.5, 0.5], [0, -0.25, 0.25], [0, 0.999, 0.0]])
@@ -206,6 +207,7 @@ def test_tessellated_shapes_have_their_volume():
         assert mesh.volume == pytest.approx(volume, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_the_image_of_a_mesh_is_that_of_the_shape():
     scanner = Scanner(d_SD=800.0, d_SR=200.0, p_u=0.4, p_v=0.5, u_0=41.3, v_0=38.7, n_u=81, n_v=77)
     mount = RigidTransform.from_angles([0.1, 0.2, 3.0], [0.2, 0.1, 0.3], source=Frame.H, target=Frame.T)

@@ -55,6 +55,7 @@ def digests(folder):
     return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
 
+@pytest.mark.slow
 def test_tiff_and_hdf5_hold_the_run_and_are_read_as_radiographs(run, tmp_path):
     for form, place in (("tiff", "radiographs"), ("hdf5", "radiographs.h5")):
         write_run(tmp_path / form, run, form=form)

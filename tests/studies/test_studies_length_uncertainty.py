@@ -245,6 +245,7 @@ def test_virtual_scans_scatter_by_noise_and_repeat():
     assert one["SD"].low <= one["SD"].mean <= one["SD"].high
 
 
+@pytest.mark.slow
 def test_raw_frames_are_corrected_by_their_own_references():
     content = scene(120.0)
     raw = content.model_copy(
