@@ -352,7 +352,7 @@ class TestRefused:
         with pytest.raises(FileError, match="does not exist"):
             run(folder / "plan.toml", "--volume", folder / "none.h5", "--out", folder / "third")
 
-        @pytest.mark.parametrize(
+    @pytest.mark.parametrize(
         ("file", "error", "words"),
         [
             ("metres.stl", UnitError, "metres"),
