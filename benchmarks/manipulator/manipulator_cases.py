@@ -12,11 +12,10 @@ from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.calibration.solve import calibrate
 from tomopose.calibration.uncertainty.trajectory import (
     object_points,
-    point_jacobian,
     rms_px,
     trajectory_sigma,
-    without_object_pose,
 )
+from tomopose.geometry.object_pose import point_jacobian, without_object_pose
 from tomopose.geometry.projection import eq5_matrices, project_ball
 from tomopose.geometry.rotations import R_x, R_y, R_z
 from tomopose.manipulator.real_poses import Repeatability

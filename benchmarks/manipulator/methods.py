@@ -25,7 +25,8 @@ from tomopose.calibration.arrangements.twin_robots import calibrate_twin
 from tomopose.calibration.identified.calibrate import calibrate_kinematic
 from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.calibration.solve import calibrate
-from tomopose.calibration.uncertainty.trajectory import object_points, rms_px, without_object_pose
+from tomopose.calibration.uncertainty.trajectory import object_points, rms_px
+from tomopose.geometry.object_pose import without_object_pose
 from tomopose.geometry.projection import eq5_matrices, project, project_ball
 from tomopose.manipulator.inverse import inverse_poses
 from tomopose.manipulator.virtual import Disturbance, real_motion

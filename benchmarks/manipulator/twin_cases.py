@@ -10,7 +10,8 @@ import numpy as np
 from tomopose import BallObservations, Calibration, Frame, PoseSequence, RigidTransform, Scanner
 from tomopose.calibration.arrangements.twin_robots import twin_matrices
 from tomopose.calibration.model.twin_projection import twin_blocks, twin_view_matrices
-from tomopose.calibration.uncertainty.trajectory import object_points, rms_px, without_object_pose
+from tomopose.calibration.uncertainty.trajectory import object_points, rms_px
+from tomopose.geometry.object_pose import without_object_pose
 from tomopose.geometry.rotations import R_x, R_y, R_z
 from tomopose.manipulator.inverse import inverse_poses
 from tomopose.manipulator.real_poses import moved

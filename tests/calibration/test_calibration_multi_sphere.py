@@ -9,9 +9,10 @@ import pytest
 
 import tomopose as tp
 from tomopose.calibration.arrangements.multi_sphere.identify import identify
-from tomopose.calibration.uncertainty.trajectory import object_points, without_object_pose
+from tomopose.calibration.uncertainty.trajectory import object_points
 from tomopose.errors import InputError, NotObservableError
 from tomopose.geometry.frames import Frame
+from tomopose.geometry.object_pose import without_object_pose
 from tomopose.geometry.projection import eq5_matrices, project
 from tomopose.geometry.rotations import R_x, R_y, R_z, exp_rotation
 from tomopose.geometry.transforms import RigidTransform

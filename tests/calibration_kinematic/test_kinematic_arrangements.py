@@ -26,8 +26,9 @@ from tomopose.calibration.model.parameters import free_parameters
 from tomopose.calibration.model.problem import pair
 from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.calibration.solve import calibrate
-from tomopose.calibration.uncertainty.trajectory import object_points, rms_px, without_object_pose
+from tomopose.calibration.uncertainty.trajectory import object_points, rms_px
 from tomopose.errors import InputError, NotConvergedError, NotObservableError
+from tomopose.geometry.object_pose import without_object_pose
 from tomopose.geometry.projection import project, project_ball
 from tomopose.geometry.rotations import R_y, R_z, rotation_angle_between
 from tomopose.manipulator.inverse import inverse_poses

@@ -21,8 +21,9 @@ from tomopose.calibration.identified.calibrate import calibrate_kinematic, machi
 from tomopose.calibration.identified.model_selection import SELECTION
 from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.calibration.solve import calibrate
-from tomopose.calibration.uncertainty.trajectory import object_points, rms_px, without_object_pose
+from tomopose.calibration.uncertainty.trajectory import object_points, rms_px
 from tomopose.errors import InputError
+from tomopose.geometry.object_pose import without_object_pose
 from tomopose.geometry.projection import project_ball
 from tomopose.io.calibration.errors_block import errors_document
 from tomopose.io.calibration_json import read_calibration, write_calibration

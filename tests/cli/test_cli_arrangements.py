@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import tomopose as tp
-from tomopose.calibration.uncertainty.trajectory import rms_px, without_object_pose
+from tomopose.calibration.uncertainty.trajectory import rms_px
 from tomopose.cli.main import run
+from tomopose.geometry.object_pose import without_object_pose
 from tomopose.geometry.projection import eq5_matrices, project_ball
 from tomopose.manipulator.files import write_manipulator
 from tomopose.manipulator.serial import poses_from_joints

@@ -49,7 +49,8 @@ def calibrate(folder, *more):
 
 def scan_error(folder, cal, truth):
     """Largest pixel error of the scan's matrices after the rigid pose of the object that fits best."""
-    from tomopose.calibration.uncertainty.trajectory import rms_px, without_object_pose
+    from tomopose.calibration.uncertainty.trajectory import rms_px
+    from tomopose.geometry.object_pose import without_object_pose
 
     words = ["matrices", "--calibration", folder / cal / "calibration.json", "--poses", folder / "scan.csv", "--quiet"]
     assert run([*map(str, words), "--out", str(folder / f"{cal}.npz")]) == 0

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import tomopose as tp
-from tomopose.calibration.uncertainty.trajectory import object_points, without_object_pose
+from tomopose.calibration.uncertainty.trajectory import object_points
 from tomopose.cli.main import run
 from tomopose.geometry.frames import Frame
+from tomopose.geometry.object_pose import without_object_pose
 from tomopose.geometry.projection import eq5_matrices
 from tomopose.geometry.rotations import R_y, R_z
 from tomopose.geometry.transforms import RigidTransform

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tomopose.calibration.uncertainty.trajectory import point_jacobian
+from tomopose.geometry.object_pose import point_jacobian
 from tomopose.geometry.rotations import exp_rotation, log_rotation, skew
 from tomopose.trajectory.completeness import source_path
 from tomopose.units import Array

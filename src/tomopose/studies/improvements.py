@@ -14,9 +14,10 @@ from tomopose.calibration.identified.calibrate import calibrate_kinematic
 from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.calibration.result import Calibration
 from tomopose.calibration.solve import calibrate
-from tomopose.calibration.uncertainty.trajectory import object_points, rms_px, trajectory_sigma, without_object_pose
+from tomopose.calibration.uncertainty.trajectory import object_points, rms_px, trajectory_sigma
 from tomopose.errors import NotConvergedError
 from tomopose.geometry.frames import Frame
+from tomopose.geometry.object_pose import without_object_pose
 from tomopose.geometry.projection import eq5_matrices, project_ball
 from tomopose.geometry.rotations import R_y, R_z
 from tomopose.geometry.scanner import Scanner

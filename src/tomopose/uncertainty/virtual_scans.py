@@ -22,11 +22,11 @@ import numpy as np
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS
 from tomopose.calibration.model.parameters import base_name
 from tomopose.calibration.result import Calibration
-from tomopose.calibration.uncertainty.trajectory import pixels, point_jacobian
 from tomopose.errors import InputError
 from tomopose.geometry.box import BOX_CORNERS
+from tomopose.geometry.object_pose import object_pose, pixels
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
-from tomopose.geometry.rotations import exp_rotation, skew
+from tomopose.geometry.rotations import exp_rotation
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.error_models import RigidErrors, correction
@@ -45,7 +45,6 @@ from tomopose.volume import Volume, VoxelGrid
 LEAST_DRAWS = 3
 SIZE_SPREAD = 0.02
 """Share by which the object is smaller or larger at most, in voxels."""
-POSE_STEPS = 4
 
 
 def simulated_errors(
@@ -199,19 +198,9 @@ def _object_held(P: Array, P_true: Array, grid: VoxelGrid) -> Array:
 
     Drawn errors may move the object as a whole, on which no length depends, out of reach of the plan's nominal places.
     """
-    half = grid.spacing * np.array(grid.n_xyz) / 4
-    corners = BOX_CORNERS * half
-    seen = pixels(P_true, grid.centre + corners)
+    corners = grid.centre + BOX_CORNERS * (grid.spacing * np.array(grid.n_xyz) / 4)
     motion = np.eye(4)
-    motion[:3, 3] = grid.centre
-    for _ in range(POSE_STEPS):
-        x = corners @ motion[:3, :3].T + motion[:3, 3]
-        G = point_jacobian(P, x)
-        J = np.concatenate([-G @ skew(x - motion[:3, 3]), G], axis=3).reshape(-1, 6)
-        step = np.linalg.lstsq(J, (seen - pixels(P, x)).ravel(), rcond=None)[0]
-        motion[:3, :3] = exp_rotation(step[:3]) @ motion[:3, :3]
-        motion[:3, 3] += step[3:]
-    motion[:3, 3] -= motion[:3, :3] @ grid.centre
+    motion[:3, :3], motion[:3, 3] = object_pose(P, pixels(P_true, corners), corners)
     return np.asarray(P @ motion)
 
 

@@ -13,9 +13,10 @@ from numpy.typing import ArrayLike
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.model.parameters import base_name
 from tomopose.calibration.result import Calibration
-from tomopose.calibration.uncertainty.trajectory import pixels, plate_points, point_jacobian, scan_jacobian
+from tomopose.calibration.uncertainty.trajectory import plate_points, scan_jacobian
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
+from tomopose.geometry.object_pose import pixels, point_jacobian
 from tomopose.geometry.projection import eq5_matrices
 from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.geometry.scanner import Scanner

@@ -12,57 +12,19 @@ from numpy.typing import ArrayLike
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks
 from tomopose.calibration.model.unseen import unseen_columns
 from tomopose.calibration.result import Calibration
-from tomopose.geometry.rotations import exp_rotation, skew
+from tomopose.geometry.box import BOX_CORNERS
+from tomopose.geometry.rotations import skew
 from tomopose.manipulator.error_models import correction
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.units import Array
 
-POSE_STEPS = 12
 RANK = 1e-9
 """Singular values of a rigid pose's columns, relative to the largest, that still move a point."""
 
 
 def object_points(half: tuple[float, float, float] = (15.0, 15.0, 30.0)) -> Array:
     """The corners (8, 3) of a box about the origin, mm."""
-    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, -1).T
-    return signs * np.asarray(half, dtype=np.float64)
-
-
-def point_jacobian(P: Array, x: Array) -> Array:
-    """d(u, v)/dx (n, m, 2, 3) of points x (m, 3) under matrices P (n, 3, 4)."""
-    h = np.einsum("nij,mj->nmi", P[:, :, :3], x) + P[:, None, :, 3]
-    w = h[..., 2:]
-    result: Array = (P[:, None, :2, :3] - (h[..., :2] / w)[..., None] * P[:, None, 2:, :3]) / w[..., None]
-    return result
-
-
-def pixels(P: Array, x: Array) -> Array:
-    """Pixels (n, m, 2) of points x (m, 3), whatever the sign of P: the W origin of a robot's home may lie behind the
-    source, and `canonical` then turns the sign of w for the object."""
-    h = np.einsum("nij,mj->nmi", P[:, :, :3], x) + P[:, None, :, 3]
-    result: Array = h[..., :2] / h[..., 2:]
-    return result
-
-
-def without_object_pose(P: ArrayLike, P_true: ArrayLike, points: ArrayLike) -> Array:
-    """Differences (n, m, 2), px, of the points' pixels under P and P_true, the best rigid object pose removed.
-
-    The pose is the one that minimises their sum of squares, found by Gauss-Newton.
-    """
-    P, P_true, x = np.asarray(P), np.asarray(P_true), np.asarray(points, dtype=np.float64)
-    target = pixels(P_true, x)
-    R, t = np.eye(3), x.mean(axis=0)
-    x = x - t
-    for _ in range(POSE_STEPS):
-        y = x @ R.T + t
-        d = pixels(P, y) - target
-        G = point_jacobian(P, y)
-        J = np.concatenate([-G @ skew(y - t), G], axis=3).reshape(-1, 6)
-        step = np.linalg.lstsq(J, -d.ravel(), rcond=None)[0]
-        R, t = exp_rotation(step[:3]) @ R, t + step[3:]
-        if np.abs(step).max() < 1e-12:
-            break
-    return pixels(P, x @ R.T + t) - target
+    return BOX_CORNERS * half
 
 
 def rms_px(d: Array) -> float:

@@ -21,7 +21,8 @@ import numpy as np
 
 from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.calibration.result import Calibration
-from tomopose.calibration.uncertainty.trajectory import object_points, rms_px, without_object_pose
+from tomopose.calibration.uncertainty.trajectory import object_points, rms_px
+from tomopose.geometry.object_pose import without_object_pose
 from tomopose.geometry.projection import eq5_matrices
 from tomopose.geometry.rotations import exp_rotation
 from tomopose.geometry.scanner import Scanner

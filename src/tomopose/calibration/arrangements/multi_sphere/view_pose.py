@@ -20,11 +20,13 @@ from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.least_squares import Solution, least_squares
 from tomopose.units import Array
 from tomopose.values import require_types, value
 
 STEPS, START_STEPS = 60, 12
 TOLERANCE = 1e-10
+"""rms of the whitened move of a step that ends the iteration."""
 LARGEST_CONDITION = 1e10
 
 
@@ -65,18 +67,18 @@ def pose_from_balls(
     if m < FEWEST_BALLS:
         raise InputError(f"{m} balls do not determine a pose; at least {FEWEST_BALLS} are needed")
     require_not_in_line(x_M)
-    C = np.tile(np.eye(2), (m, 1, 1)) if covariance is None else np.asarray(covariance, dtype=np.float64)
-    W = whiteners(C)
+    W = whiteners(np.tile(np.eye(2), (m, 1, 1)) if covariance is None else np.asarray(covariance, dtype=np.float64))
     starts = [start] if start is not None else _coarse_starts(scanner, x, x_M)
-    coarse = [_gauss_newton(scanner, x, x_M, W, s, START_STEPS if len(starts) > 1 else STEPS) for s in starts]
-    best = min(coarse, key=lambda found: found[1])
-    T, chi2, J, r, still = _gauss_newton(scanner, x, x_M, W, best[0], STEPS)
-    if not np.isfinite(chi2) or not still:
+    coarse = [_nearest_pose(scanner, x, x_M, W, s, START_STEPS if len(starts) > 1 else STEPS) for s in starts]
+    found = _nearest_pose(scanner, x, x_M, W, min(coarse, key=lambda s: s.cost).state, STEPS)
+    if not found.status.at_rest:
         raise NotConvergedError("no pose of the ball object projects its balls where they were seen; check the ids")
-    N = J.T @ J
+    N = found.J.T @ found.J
     if np.linalg.cond(N / np.sqrt(np.outer(np.diag(N), np.diag(N)))) > LARGEST_CONDITION:
         raise NotObservableError("the balls leave a direction of the pose open", direction="pose of the ball object")
-    return BallPose(T_MW=T, covariance=np.asarray(np.linalg.inv(N), dtype=np.float64), residuals=r, chi2=chi2)
+    C = np.asarray(np.linalg.inv(N), dtype=np.float64)
+    r, _ = _residuals(scanner.P_S @ scanner.T_WS.matrix, found.state, x, x_M)
+    return BallPose(T_MW=found.state, covariance=C, residuals=r, chi2=found.cost)
 
 
 def _coarse_starts(scanner: Scanner, x_D: Array, balls: Array) -> list[RigidTransform]:
@@ -117,60 +119,37 @@ def moved(T: RigidTransform, step: Array) -> RigidTransform:
     return RigidTransform(R=exp_rotation(step[:3]) @ T.R, t=T.t + step[3:], source=T.source, target=T.target)
 
 
-def _gauss_newton(
+def _nearest_pose(
     scanner: Scanner, x_D: Array, balls: Array, W: Array, start: RigidTransform, steps: int
-) -> tuple[RigidTransform, float, Array, Array, bool]:
-    """Levenberg-Marquardt: (T, chi2, weighted J, residuals px, whether it came to rest)."""
+) -> Solution[RigidTransform]:
+    """The pose that projects the balls nearest to x_D (m, 2), px, whitened by W (m, 2, 2)."""
     P = scanner.P_S @ scanner.T_WS.matrix
-    R, t = start.R, start.t
-    r, A = _weighted(P, R, t, x_D, balls, W)
-    z = np.asarray(W @ r[:, :, None], dtype=np.float64).ravel()
-    chi2 = float(z @ z) if np.isfinite(z).all() else np.inf
-    damping, still = 1e-4, False
-    for _ in range(steps):
-        if not np.isfinite(chi2):
-            break
-        N = A.T @ A
-        N[np.diag_indices(6)] *= 1 + damping
-        step = np.asarray(np.linalg.solve(N, A.T @ z), dtype=np.float64)
-        R_new, t_new = np.asarray(exp_rotation(step[:3]) @ R, dtype=np.float64), t + step[3:]
-        r_new, A_new = _weighted(P, R_new, t_new, x_D, balls, W)
-        z_new = np.asarray(W @ r_new[:, :, None], dtype=np.float64).ravel()
-        chi2_new = float(z_new @ z_new) if np.isfinite(z_new).all() else np.inf
-        if chi2_new <= chi2 * (1 + 1e-12) + 1e-18:
-            still = bool(np.abs(A @ step).max() < TOLERANCE * max(1.0, np.sqrt(chi2)) or chi2 - chi2_new < 1e-9)
-            R, t, z, chi2, r, A, damping = R_new, t_new, z_new, chi2_new, r_new, A_new, damping / 10
-            if still:
-                break
-        else:
-            damping *= 10
-            if damping > 1e10:
-                still = True
-                break
-    return RigidTransform(R=R, t=t, source=start.source, target=start.target), chi2, A, r, still
+
+    def rows(T: RigidTransform) -> tuple[Array, Array]:
+        r, J = _residuals(P, T, x_D, balls)
+        return np.asarray(W @ r[:, :, None]).ravel(), np.asarray(W @ J).reshape(-1, 6)
+
+    return least_squares(rows, moved, start, steps=steps, tolerance=TOLERANCE)
 
 
-def _weighted(P: Array, R: Array, t: Array, x_D: Array, balls: Array, W: Array) -> tuple[Array, Array]:
-    """Residuals (m, 2) px under P (3, 4) of points of W, and their derivatives W J (2m, 6) by (w, t) of the pose; nan
-    for balls behind the source."""
-    turned = balls @ R.T
-    h = (turned + t) @ P[:, :3].T + P[:, 3]
+def _residuals(P: Array, T: RigidTransform, x_D: Array, balls: Array) -> tuple[Array, Array]:
+    """Residuals (m, 2) px under P (3, 4) of points of W, and the derivatives (m, 2, 6) of the places by (w, t) of the
+    pose; nan for balls behind the source."""
+    turned = balls @ T.R.T
+    h = (turned + T.t) @ P[:, :3].T + P[:, 3]
     w = np.where(h[:, 2:] > 0, h[:, 2:], np.nan)
     x = h[:, :2] / w
     G = (P[None, :2, :3] - x[:, :, None] * P[None, 2:, :3]) / w[:, :, None]
     # dx = G (w x R b + t): row i of -G [R b]_x is G_i cross R b with its sign turned
     J = np.concatenate([np.cross(turned[:, None], G), G], axis=2)
-    return x_D - x, (W @ J).reshape(-1, 6)
+    return x_D - x, J
 
 
 def refined_pose(scanner: Scanner, x_D: Array, balls: Array, start: RigidTransform) -> RigidTransform | None:
     """The pose near `start` that is exact for three balls; None without one."""
     W = np.tile(np.eye(2), (len(balls), 1, 1))
-    try:
-        T, chi2, *_ = _gauss_newton(scanner, x_D, balls, W, start, START_STEPS)
-    except np.linalg.LinAlgError:
-        return None
-    return T if chi2 < 1.0 else None
+    found = _nearest_pose(scanner, x_D, balls, W, start, START_STEPS)
+    return found.state if found.cost < 1.0 else None
 
 
 def poses_of_views(

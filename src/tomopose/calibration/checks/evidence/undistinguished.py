@@ -21,7 +21,9 @@ from tomopose.calibration.model.parameters import FreeParameters, adjusted_scann
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.model.silhouettes import chain_matrices
 from tomopose.calibration.rigid.fit import Fit
-from tomopose.geometry.rotations import exp_rotation, skew
+from tomopose.geometry.box import BOX_CORNERS
+from tomopose.geometry.object_pose import object_pose, pixels
+from tomopose.geometry.rotations import exp_rotation
 from tomopose.units import Array
 
 VIEWS = 12
@@ -68,26 +70,12 @@ def _scan_difference(problem: Problem, free: FreeParameters, fit: Fit, alternati
     other = optimum_under(changed, free)
     P = chain_matrices(scan, adjusted_scanners(problem.scanners, free, fit.delta), fit.T_HT)
     Q = chain_matrices(executed, adjusted_scanners(problem.scanners, free, other.delta), other.T_HT)
-    corners = OBJECT_MM * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, -1).T
+    corners = OBJECT_MM * BOX_CORNERS
     return _apart(P, Q, corners + fit.t[0], corners + other.t[0])
 
 
 def _apart(P: Array, Q: Array, x: Array, y: Array) -> float:
     """px, rms of a coordinate: points x (m, 3) under P (n, 3, 4) and y under Q, a rigid motion of y taken out."""
-    target, middle = _pixels(P, x)[0], y.mean(axis=0)
-    d = np.zeros_like(target)
-    for _ in range(6):
-        at, G = _pixels(Q, y)
-        d = target - at
-        J = np.concatenate([-G @ skew(y - middle), G], axis=3).reshape(-1, 6)
-        step = np.linalg.lstsq(J, d.ravel(), rcond=None)[0]
-        y = (y - middle) @ exp_rotation(step[:3]).T + middle + step[3:]
-        middle = middle + step[3:]
-    return float(np.sqrt(np.mean((target - _pixels(Q, y)[0]) ** 2)))
-
-
-def _pixels(P: Array, x: Array) -> tuple[Array, Array]:
-    """((n, m, 2) px, (n, m, 2, 3) derivatives) of points x (m, 3) under P (n, 3, 4)."""
-    h = np.einsum("nij,mj->nmi", P[:, :, :3], x) + P[:, None, :, 3]
-    u = h[..., :2] / h[..., 2:]
-    return u, (P[:, None, :2, :3] - u[..., None] * P[:, None, 2:, :3]) / h[..., 2:, None]
+    target = pixels(P, x)
+    R, t = object_pose(Q, target, y)
+    return float(np.sqrt(np.mean((target - pixels(Q, y @ R.T + t)) ** 2)))
