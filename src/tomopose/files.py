@@ -51,6 +51,9 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
 
 def plain(value: object) -> Any:
     """A value as JSON knows it: arrays become lists, numbers that are not finite become null."""
+    kind = type(value)
+    if value is None or kind in (str, int, bool):  # most of a document
+        return value
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, np.ndarray):

@@ -17,38 +17,42 @@ from scipy.spatial.transform import Rotation
 from tomopose.errors import ConventionError, InputError, ShapeError
 from tomopose.units import Array
 
+FAR_COSINE = -0.5
+"""Cosine of the angle (120 degrees) from which a logarithm is taken by quaternions: there R - R^T begins to lose it."""
+
 GIMBAL_COSINE = 1e-9
 """Below this |cos beta| the first and third axis are parallel within rounding and only their sum is determined."""
 
 
-def _stack(rows: list[list[Array]]) -> Array:
-    shape = np.broadcast_shapes(*(np.shape(x) for row in rows for x in row))
-    M = np.empty((*shape, len(rows), len(rows[0])))
-    for i, row in enumerate(rows):
-        for j, x in enumerate(row):
-            M[..., i, j] = x
-    return M
+def _about(axis: int, angle: Array | float) -> Array:
+    """Rotation about x, y or z (0, 1, 2), shape (..., 3, 3)."""
+    a = np.asarray(angle, dtype=np.float64)
+    s, c = np.sin(a), np.cos(a)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    R = np.zeros((*a.shape, 3, 3))
+    R[..., axis, axis] = 1.0
+    R[..., i, i] = R[..., j, j] = c
+    R[..., i, j], R[..., j, i] = -s, s
+    return R
 
 
 def R_x(alpha: Array | float) -> Array:
     """Rotation about x, shape (..., 3, 3).  Paper, appendix."""
-    a = np.asarray(alpha, dtype=np.float64)
-    s, c, o, i = np.sin(a), np.cos(a), np.zeros_like(a), np.ones_like(a)
-    return _stack([[i, o, o], [o, c, -s], [o, s, c]])
+    return _about(0, alpha)
 
 
 def R_y(beta: Array | float) -> Array:
     """Rotation about y, shape (..., 3, 3).  Paper, appendix."""
-    b = np.asarray(beta, dtype=np.float64)
-    s, c, o, i = np.sin(b), np.cos(b), np.zeros_like(b), np.ones_like(b)
-    return _stack([[c, o, s], [o, i, o], [-s, o, c]])
+    return _about(1, beta)
 
 
 def R_z(gamma: Array | float) -> Array:
     """Rotation about z, shape (..., 3, 3).  Paper, appendix."""
-    g = np.asarray(gamma, dtype=np.float64)
-    s, c, o, i = np.sin(g), np.cos(g), np.zeros_like(g), np.ones_like(g)
-    return _stack([[c, -s, o], [s, c, o], [o, o, i]])
+    return _about(2, gamma)
+
+
+ABOUT = MappingProxyType({"X": R_x, "Y": R_y, "Z": R_z})
+"""The rotation about an axis, by its name."""
 
 
 def rotation_from_angles(angles: Array) -> Array:
@@ -57,6 +61,12 @@ def rotation_from_angles(angles: Array) -> Array:
     if angles.shape[-1:] != (3,):
         raise ShapeError(f"angles have shape {angles.shape}; three angles (..., 3) in rad are needed")
     return R_x(angles[..., 0]) @ R_y(angles[..., 1]) @ R_z(angles[..., 2])
+
+
+def rotation_about_axes(axes: str, angles: Array) -> Array:
+    """Rotations (n, 3, 3) of angles (n, 3), rad, about three axes in a row: capitals moved, small ones fixed."""
+    first, second, third = (ABOUT[a](angles[:, k]) for k, a in enumerate(axes.upper()))
+    return first @ second @ third if axes.isupper() else third @ second @ first
 
 
 def angles_from_rotation(R: Array) -> Array:
@@ -80,9 +90,20 @@ def exp_rotation(w: Array) -> Array:
 
 
 def log_rotation(R: Array) -> Array:
-    """Rotation vectors (..., 3), rad, of rotation matrices (..., 3, 3): the logarithm."""
+    """Rotation vectors (..., 3), rad, of rotation matrices (..., 3, 3): the logarithm.
+
+    R - R^T = 2 sin(a) [axis]_x and tr R = 1 + 2 cos(a); near half a turn, where the sine vanishes, by quaternions.
+    """
     R = np.asarray(R, dtype=np.float64)
-    return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:-2], 3)
+    twice = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
+    sine = np.sqrt((twice * twice).sum(axis=-1)) / 2
+    cosine = (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1) / 2
+    angle = np.arctan2(sine, cosine)
+    w: Array = twice * (np.divide(angle, sine, out=np.ones_like(angle), where=sine > 0) / 2)[..., None]
+    far = cosine < FAR_COSINE
+    if far.any():
+        w[far] = Rotation.from_matrix(R[far]).as_rotvec()
+    return w
 
 
 def rotation_angle_between(R_1: Array, R_2: Array) -> Array:
@@ -94,8 +115,10 @@ def rotation_angle_between(R_1: Array, R_2: Array) -> Array:
 def skew(x: Array) -> Array:
     """[x]_x with [x]_x y = x cross y, shape (..., 3, 3)."""
     x = np.asarray(x, dtype=np.float64)
-    o = np.zeros_like(x[..., 0])
-    return _stack([[o, -x[..., 2], x[..., 1]], [x[..., 2], o, -x[..., 0]], [-x[..., 1], x[..., 0], o]])
+    M = np.zeros((*x.shape, 3))
+    M[..., 2, 1], M[..., 0, 2], M[..., 1, 0] = x[..., 0], x[..., 1], x[..., 2]
+    M[..., 1, 2], M[..., 2, 0], M[..., 0, 1] = -x[..., 0], -x[..., 1], -x[..., 2]
+    return M
 
 
 @dataclass(frozen=True, kw_only=True)

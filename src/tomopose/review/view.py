@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import takewhile
 from typing import Any
@@ -42,7 +43,8 @@ def rows_view(review: Review, which: Sequence[int] | None = None) -> list[dict[s
     predicted, d = residual_lengths(review)
     usual = float(np.median(cal.d)) if len(cal.pose_id) else float("nan")
     used, last = set(cal.pose_id), {x.pose_id: x for x in review.decisions}
-    sigma = np.linalg.norm(o.sigma, axis=1)
+    x_D, sigma, at, far = (_shown(v) for v in (o.x_D, np.linalg.norm(o.sigma, axis=1), predicted, d))
+    times = _shown(d / usual) if usual > 0 else [None] * len(o)
     out = []
     for k in range(len(o)) if which is None else which:
         pose = o.pose_id[k]
@@ -53,17 +55,27 @@ def rows_view(review: Review, which: Sequence[int] | None = None) -> list[dict[s
                 "image": "" if o.image is None else o.image[k],
                 "used": pose in used,
                 "status": cal.outliers.get(pose) or (o.status[k] if o.status is not None else ""),
-                "x": o.x_D[k],
+                "x": x_D[k],
                 "sigma": sigma[k],
-                "predicted": predicted[k],
-                "d": d[k],
-                "times": d[k] / usual if usual > 0 else None,
+                "predicted": at[k],
+                "d": far[k],
+                "times": times[k],
                 "outline": _outline(o, k),
                 "decision": None if decision is None else decision.action,
                 "words": "" if decision is None else decision.words,
             }
         )
     return out
+
+
+DIGITS = 7
+"""Of a number on the page: a ten-thousandth of a pixel, on any panel."""
+
+
+def _shown(values: Array) -> list[Any]:
+    """Numbers (n,) or (n, 2) as the page takes them, rounded to DIGITS digits; None where one is not finite."""
+    rounded = [None if not math.isfinite(x) else float(f"{x:.{DIGITS}g}") for x in values.ravel().tolist()]
+    return rounded if values.ndim == 1 else [rounded[k : k + 2] for k in range(0, len(rounded), 2)]
 
 
 def _outline(o: BallObservations, k: int) -> list[float] | None:

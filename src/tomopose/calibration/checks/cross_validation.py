@@ -50,10 +50,10 @@ def held_out(fit: LinearFit) -> HeldOut:
     information = fit.information * scale[:, None] * scale
     for part in parts:
         A_b, r_b = A[part].reshape(2 * len(part), -1) * scale, r[part].ravel()
-        S_b = np.linalg.pinv(information - A_b.T @ A_b, hermitian=True, rcond=1e-14)
         # V = I + A_b S_b A_b' has as many rows as the block; what is needed of it has as many as there are parameters.
-        value, axes = np.linalg.eigh(S_b)
-        root = A_b @ (axes * np.sqrt(np.maximum(value, 0.0)))
+        value, axes = np.linalg.eigh(information - A_b.T @ A_b)
+        seen = value > 1e-14 * np.abs(value).max()
+        root = A_b @ (axes[:, seen] / np.sqrt(value[seen]))
         missed = r_b + root @ (root.T @ r_b)
         log_det = np.linalg.slogdet(np.eye(root.shape[1]) + root.T @ root)[1]
         log_predictive -= 0.5 * float(r_b @ missed + log_det)

@@ -163,15 +163,15 @@ def change_point(fit: LinearFit, beside: Beside, columns: Array, *, name: str, w
 
 def repeats(problem: Problem, scale: float) -> tuple[RepeatedPose, ...]:
     """The first pose against later images of the same pose: the check of closure."""
-    same = (
+    there = np.flatnonzero(
         (np.linalg.norm(problem.t_MH - problem.t_MH[0], axis=1) < REPEATED_MM)
-        & (rotation_angle_between(problem.R_MH[0], problem.R_MH) < REPEATED_RAD)
         & (problem.alpha == problem.alpha[0])
         & (problem.ball == problem.ball[0])
         & (problem.run == problem.run[0])
     )
+    same = there[rotation_angle_between(problem.R_MH[0], problem.R_MH[there]) < REPEATED_RAD]
     result = []
-    for k in np.flatnonzero(same)[1:]:
+    for k in same[1:]:
         dx = problem.x_D[k] - problem.x_D[0]
         V = (problem.covariance[k] + problem.covariance[0]) * scale
         result.append(

@@ -221,15 +221,14 @@ def _project_all(
     t_k: Array,
     t: Array,
     alpha: Array,
-) -> tuple[Array, Array, Array, Array, Array, Array]:
-    n = R_k.shape[0]
-    x, x_H, y_T = np.full((n, 2), np.nan), np.empty((n, 3)), np.empty((n, 3))
-    G_H, G_T, J_s = np.zeros((n, 2, 3)), np.zeros((n, 2, 3)), np.zeros((n, 2, 13))
+    found: tuple[Array, Array, Array, Array, Array, Array],
+) -> None:
+    """found: x (n, 2), x_H, y_T (n, 3), G_H, G_T (n, 2, 3), J_s (n, 2, 13) of `Projected`, of every pose."""
+    x, x_H, y_T, G_H, G_T, J_s = found
     R, M = np.empty((3, 3)), np.empty((3, 3))
-    for k in range(n):
+    for k in range(R_k.shape[0]):
         out = Projected(x[k], x_H[k], y_T[k], G_H[k], G_T[k], J_s[k], R, M)
         project_pose(s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[k], alpha[k], YES, out)
-    return x, x_H, y_T, G_H, G_T, J_s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -295,7 +294,10 @@ def projection_blocks(
     # Copies: contiguous and writable, whatever was given, so that the kernel is compiled for one kind of array.
     R_HT, t_HT, R_MH, t_MH, t_k, angle = (np.array(x, dtype=np.float64, order="C") for x in given)
     index = np.zeros(n, dtype=np.int64) if run is None else np.array(run, dtype=np.int64)
-    x, x_H, y_T, G_H, G_T, J_s = _project_all(s, index, R_HT, t_HT, R_MH, t_MH, t_k, angle)
+    # written into arrays that are made here: those that compiled code makes are slow to take over
+    x, x_H, y_T = np.full((n, 2), np.nan), np.empty((n, 3)), np.empty((n, 3))
+    G_H, G_T, J_s = np.zeros((n, 2, 3)), np.zeros((n, 2, 3)), np.zeros((n, 2, 13))
+    _project_all(s, index, R_HT, t_HT, R_MH, t_MH, t_k, angle, (x, x_H, y_T, G_H, G_T, J_s))
     return ProjectionBlocks(
         x_D=x, J_w_HT=-G_T @ skew(y_T), J_t_HT=G_T, J_t=G_H @ R_MH, J_scanner=J_s, x_H=x_H, t=t_k, R_MH=R_MH, G_H=G_H
     )

@@ -95,7 +95,9 @@ def minimise(
 def residuals(problem: Problem, free: FreeParameters, fit: Fit) -> Array:
     """(n, 2) px: observed minus calculated centres; NaN where a ball would be behind the source."""
     at = Point(np.ascontiguousarray(fit.R_HT), fit.t_HT, fit.t, fit.delta)
-    return problem.x_D - centres(rows_of(problem), freed_of(problem, free), at)
+    x = np.full((len(problem), 2), np.nan)
+    centres(rows_of(problem), freed_of(problem, free), at, x)
+    return problem.x_D - x
 
 
 def whitened2(problem: Problem, r: Array) -> Array:

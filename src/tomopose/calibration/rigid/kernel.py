@@ -116,20 +116,17 @@ def _scanner_vectors(freed: Freed, delta: Array, s: Array) -> None:
 
 
 @njit(cache=True)
-def centres(rows: Rows, freed: Freed, at: Point) -> Array:
-    """(n, 2) px: the calculated centres, without derivatives; NaN where a ball is behind the source."""
+def centres(rows: Rows, freed: Freed, at: Point, x: Array) -> None:
+    """x (n, 2) px: the calculated centres, without derivatives; left as it is where a ball is behind the source."""
     R, t, alpha, run, ball = rows.R, rows.t, rows.alpha, rows.run, rows.ball
     R_HT, t_HT, balls, _ = at
-    n = R.shape[0]
-    x = np.full((n, 2), np.nan)
     work = _work_space()
     found = work.x
     s = freed.s_0.copy()
     _scanner_vectors(freed, at.delta, s)
-    for k in range(n):
+    for k in range(R.shape[0]):
         if project_pose(s[run[k]], R_HT, t_HT, R[k], t[k], balls[ball[k]], alpha[k], NO, work):
             x[k, 0], x[k, 1] = found[0], found[1]
-    return x
 
 
 @njit(cache=True)
@@ -190,8 +187,12 @@ def normal_equations(rows: Rows, s: Array, freed: Freed, at: Point, N: Array, g:
         for i in range(w):
             p, q, wi = weight[k] * a[i], weight[k] * b[i], where[i]
             g[wi] += p * r0 + q * r1
-            for j in range(i + 1):
-                N[wi, where[j]] += p * a[j] + q * b[j]
+            if n_b == 1:  # every unknown is at its own place: the same sums, written without a detour
+                for j in range(i + 1):
+                    N[i, j] += p * a[j] + q * b[j]
+            else:
+                for j in range(i + 1):
+                    N[wi, where[j]] += p * a[j] + q * b[j]
     for j in range(n_f):
         chi2 += information[j] * delta[j] * delta[j]
         g[6 + 3 * n_b + j] -= information[j] * delta[j]

@@ -124,8 +124,6 @@ def direction_and_remedy(problem: Problem, names: tuple[str, ...], v: Array) -> 
     main = {base_name(n) for n, x in zip(names, size, strict=True) if x >= SHOWN * size.max()}
     ball = [j for j, n in enumerate(names) if n.startswith(("t_x", "t_y", "t_z", "t["))]
     moved = v[ball].reshape(-1, 3)
-    turned = problem.R_MH @ problem.R_MH[0].T
-    rotates = np.abs(turned - np.eye(3)).max() > 1e-9
     still = np.ptp(problem.alpha) == 0.0
     scanner_names = main & set(MATTERS)
     if scanner_names and still:
@@ -141,7 +139,7 @@ def direction_and_remedy(problem: Problem, names: tuple[str, ...], v: Array) -> 
         axis = moved[np.abs(moved).max(axis=1).argmax()]
         axis = np.round(axis / np.linalg.norm(axis) * (np.sign(axis[np.abs(axis).argmax()]) or 1.0), 2) + 0.0
         where = f"({axis[0]:.2f}, {axis[1]:.2f}, {axis[2]:.2f})"
-        if not rotates:
+        if np.abs(problem.R_MH @ problem.R_MH[0].T - np.eye(3)).max() <= 1e-9:
             return (
                 f"t_HT and t cannot be distinguished ({words}): no pose rotates the moved plate",
                 "add poses rotated about two different axes",

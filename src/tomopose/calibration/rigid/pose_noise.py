@@ -94,11 +94,12 @@ def _minus_2_log_likelihood(
         y = (r[k, 1] - l10 * x) / l11
         total += x * x + y * y
         for i in range(m):
-            p[i] = J[k, 0, i] / l00
-            q[i] = (J[k, 1, i] - l10 * p[i]) / l11
-            g[i] += p[i] * x + q[i] * y
+            p_i = J[k, 0, i] / l00
+            q_i = (J[k, 1, i] - l10 * p_i) / l11
+            p[i], q[i] = p_i, q_i
+            g[i] += p_i * x + q_i * y
             for j in range(i + 1):
-                N[i, j] += p[i] * p[j] + q[i] * q[j]
+                N[i, j] += p_i * p[j] + q_i * q[j]
     for i in range(m):
         N[i, i] += information[i]
         g[i] -= pull[i]

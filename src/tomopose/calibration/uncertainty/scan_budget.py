@@ -58,6 +58,8 @@ def shares_of(
         S = C[np.ix_(which, which)]
         scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
         G = C[:, which] * scale
+        if len(which) == 1:  # scaled to 1, or without any variance
+            return np.asarray(C - G @ G.T)
         return np.asarray(C - G @ np.linalg.pinv(S * scale[:, None] * scale, rcond=1e-12) @ G.T)
 
     total = rms(covariance)

@@ -37,7 +37,7 @@ from tomopose.calibration.model.parameters import UNITS, FreeParameters, free_pa
 from tomopose.calibration.model.problem import Problem, pair
 from tomopose.calibration.rigid.estimate import best_fit
 from tomopose.calibration.rigid.fit import Fit, residuals
-from tomopose.calibration.rigid.start import ray_equations
+from tomopose.calibration.rigid.start import Cameras, ray_equations
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.inverse import inverse_poses
@@ -57,13 +57,13 @@ class _Declared:
     placed: Placement
     beam: Array
 
-    @property
+    @functools.cached_property
     def n_prior(self) -> int:
         return int((self.free.information > 0).sum())
 
     def hypothesis(self, chi2: float) -> Hypothesis:
         """The declared reading with another chi2: where movements are followed."""
-        return replace(self.own, chi2=chi2)
+        return self.own if chi2 == self.own.chi2 else replace(self.own, chi2=chi2)
 
     def dof(self, problem: Problem) -> int:
         result: int = 2 * len(problem) + self.n_prior - self.fit.N.shape[0]
@@ -113,7 +113,8 @@ def ranked(
     truth (of that the closed form finds the optimum); with 0 it is left out.
     """
     held = free_parameters(problem.scanners, fix=tuple(UNITS))
-    rays = ray_equations(problem)
+    cameras = Cameras.of(problem)
+    rays = ray_equations(problem, cameras)
     beam = beams(problem)
     declared = _Declared(problem=problem, free=free, fit=fit, placed=placement(problem, fit, beam), beam=beam)
     hopeless = HOPELESS * max(fit.chi2, float(declared.own.dof))
@@ -122,8 +123,9 @@ def ranked(
         changed = alternative.change(problem)
         if changed is None or declared.dof(changed) <= 0:
             continue
-        same_rays = changed.x_D is problem.x_D and changed.alpha is problem.alpha
-        of_changed = rays if same_rays else ray_equations(changed)
+        same_table = changed.alpha is problem.alpha
+        known = cameras if same_table else None
+        of_changed = rays if same_table and changed.x_D is problem.x_D else ray_equations(changed, known)
         tried.append((alternative, Reading.of(changed, of_changed, thoroughly=starts > 0)))
     found = [declared.own]
     for (alternative, one), start in zip(tried, linear_starts([one for _, one in tried]), strict=True):

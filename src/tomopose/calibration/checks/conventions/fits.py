@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -72,6 +73,14 @@ def size_ratio(problem: Problem, free: FreeParameters, fit: Fit) -> float:
     return float("nan") if found is None else found
 
 
+@functools.lru_cache(maxsize=16)
+def _spread(n: int) -> npt.NDArray[np.int64]:
+    """FIRST_ROWS rows, spread evenly over n."""
+    rows = np.unique(np.linspace(0, n - 1, FIRST_ROWS).round().astype(np.int64))
+    rows.flags.writeable = False
+    return rows
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reading:
     """A problem as an alternative reads it, with its rays and the rows (k,) that it is fitted to first."""
@@ -85,8 +94,7 @@ class Reading:
         """With all rows first where they are few, or where it is to be thorough."""
         n = len(problem)
         few = thoroughly or n <= 2 * FIRST_ROWS or len(problem.ball_ids) > 1
-        rows = np.arange(n) if few else np.unique(np.linspace(0, n - 1, FIRST_ROWS).round().astype(np.int64))
-        return cls(problem=problem, rays=rays, rows=rows)
+        return cls(problem=problem, rays=rays, rows=np.arange(n) if few else _spread(n))
 
     @property
     def whole(self) -> bool:

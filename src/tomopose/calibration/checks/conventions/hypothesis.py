@@ -257,4 +257,4 @@ def compared(declared: Hypothesis, other: Hypothesis) -> Hypothesis:
 def _order(h: Hypothesis) -> tuple[int, float]:
     """Better ones first, then the declared reading, then the others by their fit."""
     # readings that are the same for these poses keep their place in the list: rounding does not rank them
-    return {"better": 0, "declared": 1}.get(h.outcome, 2), round(h.delta, 6)
+    return {"better": 0, "declared": 1}.get(h.outcome, 2), round(float(f"{h.delta:.6g}"), 6)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from tomopose.calibration.checks.conventions.alternative import Alternative, Change
 from tomopose.calibration.model.problem import Problem, rotated
-from tomopose.geometry.rotations import CONVENTIONS, convention_from_rotation, exp_rotation
+from tomopose.geometry.rotations import CONVENTIONS, convention_from_rotation, exp_rotation, rotation_about_axes
 from tomopose.units import Array
 
 EULER_ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
@@ -53,17 +53,13 @@ def moved_axes(axes: str) -> str:
     return axes if axes.isupper() else axes[::-1].upper()
 
 
-def _euler(axes: str, angles: Array) -> Array:
-    return Rotation.from_euler(axes, angles).as_matrix()
-
-
 def _as_declared(kind: str, axes: str, xyz: Array) -> Array:
     """The rotations of numbers by axis under the declared kind."""
     if kind == "rotvec":
         return exp_rotation(xyz)
     if axes[0].upper() == axes[2].upper():
-        return _euler(axes, xyz)
-    return _euler(axes, xyz[:, ["XYZ".index(a) for a in axes.upper()]])
+        return rotation_about_axes(axes, xyz)
+    return rotation_about_axes(axes, xyz[:, ["XYZ".index(a) for a in axes.upper()]])
 
 
 def _signs(signs: tuple[int, int, int]) -> Change:
@@ -89,7 +85,7 @@ def _order(order: str, *, reversed_columns: bool = False) -> Change:
         if (declared and not reversed_columns) or (reversed_columns and kind == "quaternion"):
             return None
         columns = xyz[:, ::-1] if reversed_columns else xyz
-        return rotated(p, _euler(order, columns[:, ["XYZ".index(a) for a in order]]))
+        return rotated(p, rotation_about_axes(order, columns[:, ["XYZ".index(a) for a in order]]))
 
     return change
 
@@ -99,7 +95,7 @@ def _proper_euler(order: str) -> Change:
         kind, axes, columns = _written(p)
         if kind == "quaternion" or (kind == "euler" and axes == order):
             return None
-        return rotated(p, _euler(order, columns))
+        return rotated(p, rotation_about_axes(order, columns))
 
     return change
 

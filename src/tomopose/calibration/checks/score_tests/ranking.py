@@ -12,6 +12,7 @@ leaves more than the stated sigmas explain; the second holds where the stated si
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -80,14 +81,12 @@ class Explanation:
         }
 
 
-def _evidence(gain: Array, c: Array | int, chi2: float, dof: int, n: int, looks: float) -> Array:
+def _evidence(gain: float, c: int, chi2: float, dof: int, n: int, looks: float) -> float:
     """See the module; chi2 and dof are what is left before the effect."""
-    left = np.maximum(chi2 - gain, 1e-9 * max(chi2, 1e-300))
+    left = max(chi2 - gain, 1e-9 * max(chi2, 1e-300))
     # a chi2 below its expectation says that the stated sigmas are too large, and makes nothing significant
-    f = max(dof - float(np.max(c)), 1.0)
-    free_scale = 0.5 * f * np.log(chi2 / left)
-    known = 0.5 * gain
-    return np.asarray(np.minimum(free_scale, known) - 0.5 * np.asarray(c) * np.log(2.0 * n) - np.log(looks))
+    free_scale = 0.5 * max(dof - c, 1) * math.log(max(chi2, 1e-300) / left)
+    return min(free_scale, 0.5 * gain) - 0.5 * c * math.log(2.0 * n) - math.log(looks)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,12 +152,12 @@ def _plain(problem: Problem, columns: Sequence[Columns], white: Whitened, looks:
         gain, rank = gain_of(p.M[part, part], p.g[part])
         if not rank:
             continue
-        evidence = float(_evidence(np.array(gain), rank, chi2, dof, n, looks)) + c.effect.odds
+        evidence = _evidence(gain, rank, chi2, dof, n, looks) + c.effect.odds
         if c.constant:
             # a constant belongs to the scanner's values: what varies must show by itself
             least = slice(part.start, part.start + c.constant)
             without, r0 = gain_of(p.M[least, least], p.g[least])
-            varies = float(_evidence(np.array(gain - without), max(rank - r0, 1), chi2 - without, dof, n, looks))
+            varies = _evidence(gain - without, max(rank - r0, 1), chi2 - without, dof, n, looks)
             evidence = evidence if varies > DECISIVE else min(evidence, varies)
         one = part.stop - part.start == 1
         k = part.start
@@ -190,7 +189,7 @@ def _step(steps: Steps, white: Whitened, looks: float) -> _Candidate | None:
     places = np.arange(steps.least, n - steps.least + 1)
     k, gain, rank = best_step(C, white.beside, places)
     chi2, dof = white.beside.chi2, white.beside.dof
-    evidence = float(_evidence(np.array(gain), rank, chi2, dof, n, looks * len(places)))
+    evidence = _evidence(gain, rank, chi2, dof, n, looks * len(places))
 
     def late() -> Array:
         return np.asarray((C * (np.arange(n) >= k)[:, None, None]).reshape(2 * n, c))

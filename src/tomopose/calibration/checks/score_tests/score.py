@@ -139,6 +139,8 @@ class Beside:
 
 def gain_of(M: Array, g: Array) -> tuple[float, int]:
     """(g^T M^+ g, rank)."""
+    if len(g) == 1:
+        return (float(g[0] ** 2 / M[0, 0]), 1) if M[0, 0] > SEEN else (0.0, 0)
     value, V = np.linalg.eigh(M)
     z = V.T @ g
     seen = value > SEEN
