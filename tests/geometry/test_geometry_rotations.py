@@ -19,6 +19,7 @@ from tomopose.geometry.rotations import (
     convention_from_rotation,
     exp_rotation,
     log_rotation,
+    rotation_about_axes,
     rotation_angle_between,
     rotation_from_angles,
     rotation_from_convention,
@@ -98,6 +99,31 @@ def test_unknown_convention_lists_the_known_ones():
 def test_log_is_the_inverse_of_exp(rng):
     w = rng.uniform(-1.7, 1.7, (50, 3))  # shorter than pi, where the logarithm is unique
     assert_allclose(log_rotation(exp_rotation(w)), w, atol=1e-12)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-12, 1e-6, 0.1, 1.0, 2.0, 2.0944, 2.2, 3.0, np.pi - 1e-6, np.pi])
+def test_the_logarithm_is_that_of_scipy_at_every_angle(turn):
+    axes = np.random.default_rng(5).normal(size=(200, 3))
+    w = turn * axes / np.linalg.norm(axes, axis=1)[:, None]
+    R = Rotation.from_rotvec(w).as_matrix()
+    away = exp_rotation(log_rotation(R)) - R  # half a turn has two logarithms
+    assert_allclose(away, 0.0, atol=2e-15)
+    if turn < np.pi - 1e-5:
+        assert_allclose(log_rotation(R), Rotation.from_matrix(R).as_rotvec(), atol=1e-14)
+
+
+def test_single_rotations_and_stacks_have_the_same_logarithm():
+    R = exp_rotation(np.random.default_rng(6).normal(size=(2, 5, 3)))
+    found = log_rotation(R)
+    assert found.shape == (2, 5, 3)
+    for i, j in np.ndindex(2, 5):
+        assert_allclose(log_rotation(R[i, j]), found[i, j], atol=1e-15)
+
+
+@pytest.mark.parametrize("axes", ["XYZ", "ZYX", "ZYZ", "ZXZ", "xyz", "zyx", "yxz"])
+def test_products_about_axes_are_those_of_scipy(axes):
+    angles = np.random.default_rng(7).uniform(-3, 3, (50, 3))
+    assert_allclose(rotation_about_axes(axes, angles), Rotation.from_euler(axes, angles).as_matrix(), atol=2e-15)
     assert_allclose(skew(w[0]) @ w[1], np.cross(w[0], w[1]))
 
 

@@ -140,7 +140,7 @@ def test_every_answer_forbids_other_sources(served):
 def test_the_page_names_nothing_from_elsewhere(served):
     _, _, page = served.own("GET", "")
     names = [n for n in page.decode().split('"') if n.startswith("static/")]
-    assert len(names) == 5
+    assert len(names) == 6
     for name in names:
         status, _, text = served.own("GET", name)
         assert status == 200

@@ -32,14 +32,16 @@ def require_scanner_shape(shape: tuple[int, int], scanner: Scanner, name: str) -
     raise ShapeError(f"{found}: this scanner file does not belong to these images")
 
 
-def endianness_note(image: Image, name: str) -> list[str]:
-    """InputError if a 16-bit image was read with its bytes exchanged; a note if it carries 8 bits only."""
-    if image.dtype.kind not in "ui" or image.dtype.itemsize != 2:
-        return []
-    n_v, n_u = image.shape
-    v, u = max(0, (n_v - WINDOW) // 2), max(0, (n_u - WINDOW) // 2)
-    part = np.ascontiguousarray(image[v : v + WINDOW, u : u + WINDOW])
-    if part.shape[1] < 2:
+def middle(shape: tuple[int, int]) -> tuple[int, int, int, int]:
+    """(v0, v1, u0, u1) of the window in an image's middle by which its bytes are judged."""
+    (v0, v1), (u0, u1) = ((max(0, (n - WINDOW) // 2), max(0, (n - WINDOW) // 2) + min(n, WINDOW)) for n in shape)
+    return v0, v1, u0, u1
+
+
+def endianness_note(part: Image, name: str) -> list[str]:
+    """InputError if the `middle` of a 16-bit image was read with its bytes exchanged; a note if it carries 8 bits
+    only."""
+    if part.dtype.kind not in "ui" or part.dtype.itemsize != 2 or part.shape[1] < 2:
         return []
     low, high = part & 0xFF, part.astype(np.uint16) >> 8
     if np.ptp(low) == 0 and np.ptp(high) > 0:

@@ -14,7 +14,7 @@ import numpy as np
 from tomopose.errors import ConventionError, FileError, InputError, InputWarning
 from tomopose.files import natural_key
 from tomopose.geometry.scanner import Scanner
-from tomopose.io.images.checks import endianness_note, require_scanner_shape
+from tomopose.io.images.checks import endianness_note, middle, require_scanner_shape
 from tomopose.io.images.correction import correction, require_uncorrected
 from tomopose.io.images.formats.dicom import open_dicom
 from tomopose.io.images.formats.hdf5 import Hdf5Source, open_hdf5
@@ -129,7 +129,7 @@ def open_images(
     if gaps:
         notes.append(f"the numbering leaves out {len(gaps)} numbers, the first is {gaps[0]}")
     with reading(paths[0], "radiograph"):
-        notes += endianness_note(plain[0], frames.names[0])
+        notes += endianness_note(plain.region(0, *middle(frames.shape)), frames.names[0])
     bad = None if bad_pixels is None else _mask(bad_pixels, frames.shape)
     D, F = _mean(dark, order, raw_layout), _mean(flat, order, raw_layout)
     if isinstance(frames, Hdf5Source | XradiaSource) and D is None and F is None and frames.flats:

@@ -38,6 +38,7 @@ export class Picture {
     if (this.row !== row) return;
     this.shown = crop;
     this.draw();
+    if (crop) this.canvas.dataset.drawn = String(k);
   }
 
   draw() {
