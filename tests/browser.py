@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -47,3 +50,33 @@ def violations(page) -> list[str]:
         for v in found
         if v["impact"] in ("serious", "critical")
     ]
+
+
+ADDRESS = re.compile(r"http://127\.0\.0\.1:\d+/[\w-]{43}/")
+
+
+@contextmanager
+def review_address(*words: str) -> Iterator[str]:
+    """The address of `tomopose review WORDS` in a process of its own, as a person starts it."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tomopose", "review", *words, "--no-browser"], stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    line = process.stdout.readline()
+    found = ADDRESS.search(line)
+    assert found, (line, process.stderr.read() if process.poll() is not None else "")
+    yield found[0]
+    process.terminate()
+    process.wait(timeout=30)
+    process.stdout.close()
+    process.stderr.close()
+
+
+def open_page(browser, address: str, *, width: int = 1400, scheme: str = "light"):
+    """A page with a list `said` of everything that it said to the console."""
+    page = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme).new_page()
+    page.said = []
+    page.on("console", lambda message: page.said.append(message.text))
+    page.on("pageerror", lambda error: page.said.append(str(error)))
+    page.goto(address)
+    return page

@@ -1,6 +1,8 @@
 """Runs the studies at small scale and keeps their pictures for docs/gallery.md in docs/images/gallery.
 
 python docs/images/make_gallery.py [STUDY ...]
+
+Ends with code 1 where texts of a drawing lie over one another, or a legend over its data.
 """
 
 from __future__ import annotations
@@ -27,13 +29,17 @@ KEPT = {
 
 def main() -> None:
     FOLDER.mkdir(exist_ok=True)
+    bad = 0
     for name in sys.argv[1:] or KEPT:
         for old in FOLDER.glob(f"{name}-*.png"):
             old.unlink()
         figures = run_study(name).figures
         for k in KEPT[name]:
-            figure_png(FOLDER / f"{name}-{k}.png", figures[k - 1])
-            print(FOLDER / f"{name}-{k}.png", figures[k - 1].title)
+            hidden = figure_png(FOLDER / f"{name}-{k}.png", figures[k - 1])
+            print(FOLDER / f"{name}-{k}.png", figures[k - 1].title, *hidden, sep="; ", flush=True)
+            bad += len(hidden)
+    if bad:
+        sys.exit(f"{bad} overlaps in the gallery's drawings")
 
 
 if __name__ == "__main__":

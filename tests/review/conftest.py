@@ -49,11 +49,20 @@ def radiograph(scanner: tp.Scanner, x: np.ndarray, ellipse: tuple, rng: np.rando
     return np.clip(rng.normal(level, 200.0), 0, 65_535).astype(np.uint16)
 
 
+def draw(path: Path, scanner: tp.Scanner, centre: np.ndarray, rng: np.random.Generator) -> None:
+    """Write the radiograph of a ball whose projected centre is (u, v)."""
+    found = silhouette_ellipse(scanner, centre, float(np.arcsin(DIAMETER / 2 / scanner.d_SR)))
+    tp.write_tiff(path, radiograph(scanner, centre, found, rng))
+
+
+def mount() -> tp.RigidTransform:
+    return tp.RigidTransform.from_angles([0.02, -0.03, 3.05], [2.0, -1.5, 4.0], source=Frame.H, target=Frame.T)
+
+
 def make_project(folder: Path, *, images: int = N) -> Project:
     """Write the project; radiographs of the first `images` poses alone are drawn, the others show the same picture."""
     folder.mkdir(parents=True)
     scanner = tp.Scanner(d_SD=1500.0, d_SR=283.5, p_u=0.8, p_v=0.84, u_0=255.4, v_0=244.8, n_u=512, n_v=489)
-    T_HT = tp.RigidTransform.from_angles([0.02, -0.03, 3.05], [2.0, -1.5, 4.0], source=Frame.H, target=Frame.T)
     steps = (-10.0, 0.0, 10.0)
     turns = [np.zeros(3)] + [s * 5.0 * np.eye(3)[k] for k in range(3) for s in (1, -1)]
     rows = [((x, y, z), r, a) for a in (0.0, np.pi / 2) for x in steps for y in steps for z in steps for r in turns][:N]
@@ -62,7 +71,7 @@ def make_project(folder: Path, *, images: int = N) -> Project:
         [p for p, _, _ in rows], np.array([r for _, r, _ in rows]), alpha=np.array([a for _, _, a in rows]), pose_id=ids
     )
     rng = np.random.default_rng(20260203)
-    exact = project_ball(scanner, T_HT=T_HT, T_MH=poses.T_MH, t=T_BALL, alpha=poses.alpha)
+    exact = project_ball(scanner, T_HT=mount(), T_MH=poses.T_MH, t=T_BALL, alpha=poses.alpha)
     x = exact + rng.normal(scale=NOISE_PX, size=exact.shape)
     bad = np.sort(rng.choice(N, SPOILT, replace=False))
     x[bad] += rng.choice([-1, 1], (SPOILT, 2)) * rng.uniform(0.5, 2.0, (SPOILT, 2))
@@ -78,8 +87,7 @@ def make_project(folder: Path, *, images: int = N) -> Project:
     tp.write_observations(folder / "observations.csv", replace(observations, ball_diameter=None))
     (folder / "radiographs").mkdir()
     for k, name in enumerate(ids[:images]):
-        true = silhouette_ellipse(scanner, exact[k], gamma)
-        tp.write_tiff(folder / "radiographs" / f"{name}.tif", radiograph(scanner, exact[k], true, rng))
+        draw(folder / "radiographs" / f"{name}.tif", scanner, exact[k], rng)
     for name in ids[images:]:
         (folder / "radiographs" / f"{name}.tif").hardlink_to(folder / "radiographs" / f"{ids[0]}.tif")
     project = Project(folder=folder, spoilt=tuple(ids[k] for k in bad))
@@ -114,3 +122,11 @@ def copy_of(project: Project, folder: Path) -> Project:
     """Another folder with the same files; pictures, which nobody changes, are linked."""
     shutil.copytree(project.folder, folder, copy_function=copy_or_link)
     return replace(project, folder=folder)
+
+
+@pytest.fixture
+def drawn(pattern):
+    """Writes the radiograph of pose k of the run to a path."""
+    scanner, poses = tp.read_scanner(pattern.folder / "scanner.json"), tp.read_poses(pattern.folder / "poses.csv")
+    centres = project_ball(scanner, T_HT=mount(), T_MH=poses.T_MH, t=T_BALL, alpha=poses.alpha)
+    return lambda path, k: draw(path, scanner, centres[k], np.random.default_rng(k))

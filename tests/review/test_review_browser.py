@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
-import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from browser import open_browser, violations
+from browser import open_browser, open_page, review_address, violations
 from tomopose.calibration.records.decisions import read_decisions
 from tomopose.cli.main import run
 
@@ -27,27 +23,8 @@ PIXELS = "(c => c.getContext('2d').getImageData(0, 0, c.width, c.height).data)(d
 @pytest.fixture
 def address(project):
     """A review of the project in a process of its own, as a person starts it."""
-    words = [
-        "review",
-        str(project.cal),
-        "--no-browser",
-        "--who",
-        "N. Sato",
-        "--images",
-        str(project.folder / "radiographs"),
-    ]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tomopose", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-    )  # fmt: skip
-    line = process.stdout.readline()
-    found = re.search(r"http://127\.0\.0\.1:\d+/[\w-]{43}/", line)
-    assert found, (line, process.stderr.read() if process.poll() is not None else "")
-    yield found[0]
-    process.terminate()
-    process.wait(timeout=30)
-    process.stdout.close()
-    process.stderr.close()
+    with review_address(str(project.cal), "--who", "N. Sato", "--images", str(project.folder / "radiographs")) as found:
+        yield found
 
 
 @pytest.fixture
@@ -57,11 +34,7 @@ def browser():
 
 
 def visit(browser, address: str, *, width: int = 1400, scheme: str = "light"):
-    page = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme).new_page()
-    page.said = []
-    page.on("console", lambda message: page.said.append(message.text))
-    page.on("pageerror", lambda error: page.said.append(str(error)))
-    page.goto(address)
+    page = open_page(browser, address, width=width, scheme=scheme)
     page.wait_for_selector("body[data-ready]")
     page.wait_for_selector("#tabs button")
     return page

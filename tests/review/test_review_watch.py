@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
+import threading
 
 import numpy as np
 import pytest
@@ -54,6 +55,53 @@ def test_a_damaged_image_is_named_and_does_not_end_the_run(watcher):
     states = {a["pose"]: a["x"] for a in watched.state["arrived"]}
     assert states["p001"] is None
     assert states["p000"] is not None
+
+
+def test_an_image_that_is_written_anew_is_measured_again(watcher):
+    watched, picture = watcher
+    target = watched.setup.folder / "p000.tif"
+    target.write_bytes(b"II*\0nonsense")
+    watched.look()
+    assert watched.look()
+    assert [a["x"] for a in watched.state["arrived"]] == [None]
+    assert not watched.look()
+    shutil.copy(picture, target)
+    watched.look()
+    assert watched.look()
+    (arrived,) = watched.state["arrived"]
+    assert arrived["status"] == "ok"
+    assert not watched.look()
+
+
+def test_a_folder_that_is_gone_for_a_moment_changes_nothing(watcher):
+    watched, picture = watcher
+    shutil.copy(picture, watched.setup.folder / "p000.tif")
+    watched.look()
+    watched.look()
+    aside = watched.setup.folder.with_name("aside")
+    watched.setup.folder.rename(aside)
+    assert not watched.look()
+    aside.rename(watched.setup.folder)
+    assert not watched.look()
+    assert len(watched.state["arrived"]) == 1
+
+
+def test_before_the_first_look_the_state_is_that_of_an_empty_run(watcher):
+    watched, _ = watcher
+    assert (watched.state["arrived"], watched.state["expected"]) == ([], 200)
+
+
+def test_a_watch_that_fails_says_so_on_the_page(watcher, monkeypatch):
+    watched, _ = watcher
+
+    def broken():
+        raise RuntimeError("no more memory")
+
+    monkeypatch.setattr(watched, "look", broken)
+    with pytest.raises(RuntimeError):
+        watched.run(threading.Event(), seconds=0.0)
+    assert watched.state["failed"]
+    assert "not being watched any more (RuntimeError: no more memory)" in watched.state["words"]
 
 
 def test_names_come_from_the_table_or_from_the_pose_ids(watcher):

@@ -161,42 +161,72 @@ def _next(setup: Setup, taken: PoseSequence, T_HT: RigidTransform, ball: np.ndar
 
 @dataclass
 class Watcher:
-    """Looks into the folder again and again; the one place that changes.  A file counts when its size has settled."""
+    """Looks into the folder again and again; the one place that changes.
+
+    A file counts when its size has settled; one whose size changes later is measured again.
+
+    measured: file name -> its size when it was measured, and what was found;  sizes: when last looked at.
+    """
 
     setup: Setup
-    arrived: list[Arrived] = field(default_factory=list)
+    measured: dict[str, tuple[int, Arrived]] = field(default_factory=dict)
     sizes: dict[str, int] = field(default_factory=dict)
     state: dict[str, Any] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
+    def __post_init__(self) -> None:
+        self.state = progress(self.setup, [])
+
+    @property
+    def arrived(self) -> list[Arrived]:
+        """In the order in which they were measured."""
+        return [found for _, found in self.measured.values()]
+
     def look(self) -> bool:
         """Take in what is new and whole; whether anything was.  Files without a pose in the table are left alone."""
         names = expected_names(self.setup.poses)
-        done = {a.image for a in self.arrived}
-        new = False
-        for path in sorted(self.setup.folder.iterdir()) if self.setup.folder.is_dir() else ():
-            if path.name not in names or path.name in done or not path.is_file():
-                continue
-            size = path.stat().st_size
-            if self.sizes.get(path.name) != size or size == 0:
-                self.sizes[path.name] = size
-                continue
+        settled = self._settled(names)
+        for path, size in settled:
             try:
                 found = measure(self.setup, path, names[path.name])
-            except TomoposeError as error:  # still being written, or damaged: it is tried again when its size changes
-                self.sizes[path.name] = -1
+            except TomoposeError as error:  # damaged, or not yet whole: measured again when its size changes
                 found = Arrived(pose_id=names[path.name], image=path.name, x=None, covariance=None, status=str(error))
-            self.arrived.append(found)
-            new = True
-        if new or not self.state:
-            state = progress(self.setup, self.arrived)
-            with self.lock:
-                self.state = state
-        return new
+            self.measured.pop(path.name, None)
+            self.measured[path.name] = (size, found)
+        if settled:
+            self._show(progress(self.setup, self.arrived))
+        return bool(settled)
+
+    def _settled(self, names: dict[str, str]) -> list[tuple[Path, int]]:
+        """Files of the run that have kept their size since the last look, and were not measured at it."""
+        found = []
+        try:
+            there = sorted(p for p in self.setup.folder.iterdir() if p.name in names)
+        except OSError:  # a share that is gone for a moment
+            return []
+        for path in there:
+            try:
+                size = path.stat().st_size
+            except OSError:  # moved away since it was listed
+                continue
+            known = self.sizes.get(path.name) == size and size > 0
+            self.sizes[path.name] = size
+            if known and self.measured.get(path.name, (-1, None))[0] != size:
+                found.append((path, size))
+        return found
+
+    def _show(self, state: dict[str, Any]) -> None:
+        with self.lock:
+            self.state = state
 
     def run(self, stop: threading.Event, seconds: float = 1.0, said: Callable[[str], None] = lambda text: None) -> None:
-        """Look until it is told to stop."""
-        while not stop.is_set():
-            if self.look():
-                said(f"{len(self.arrived)} of {len(self.setup.poses)} images")
-            stop.wait(seconds)
+        """Look until it is told to stop.  Should that fail, the page says so: it never goes on showing an old state."""
+        try:
+            while not stop.is_set():
+                if self.look():
+                    said(f"{len(self.measured)} of {len(self.setup.poses)} images")
+                stop.wait(seconds)
+        except Exception as error:
+            words = f"The run is not being watched any more ({type(error).__name__}: {error}); start the review again."
+            self._show({**self.state, "words": words, "verdict": None, "failed": True})
+            raise

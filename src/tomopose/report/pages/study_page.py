@@ -13,6 +13,7 @@ import numpy as np
 from tomopose.errors import EngineMissingError
 from tomopose.files import atomic_file
 from tomopose.provenance import Provenance
+from tomopose.report.overlaps import overlaps
 from tomopose.report.page import BAD, GOOD, Block, Figure, KeyFigure, Page, Section, Table, Verdict, Words, render
 from tomopose.report.sections.provenance import provenance_section
 from tomopose.report.words import number
@@ -122,6 +123,10 @@ def _pyplot() -> Any:
     return plt
 
 
+LEVEL_LETTERS = 90
+"""Letters that fit under a drawing side by side; longer rows of names are slanted."""
+
+
 def _text(value: object) -> str:
     """A title of plotly's: a string or {"text": ...}."""
     return str(value.get("text", "")) if isinstance(value, Mapping) else str(value or "")
@@ -192,7 +197,9 @@ def _draw(ax: Axes, trace: Mapping[str, Any], k: int, n: int) -> None:
         ax.bar(
             [i + (k - (n - 1) / 2) * 0.8 / n for i in x], trace["y"], width=0.8 / n, color=marker.get("color"), **shown
         )
-        ax.set_xticks(list(x), [str(t) for t in trace["x"]], rotation=20, ha="right")
+        words = [str(t) for t in trace["x"]]
+        slanted = max(map(len, words), default=0) * len(words) > LEVEL_LETTERS
+        ax.set_xticks(list(x), words, **({"rotation": 20, "ha": "right"} if slanted else {}))
     elif kind == "heatmap":
         values = np.array([[np.nan if v is None else v for v in line] for line in trace["z"]], dtype=np.float64)
         picture = ax.pcolormesh(
@@ -210,9 +217,23 @@ def _draw(ax: Axes, trace: Mapping[str, Any], k: int, n: int) -> None:
         raise ValueError(f"a trace of type {kind!r} cannot be drawn")
 
 
-def figure_png(path: str | Path, figure: Figure) -> None:
+def _space_marks(ax: Any) -> None:
+    """Marks of three axes in space, as many as there is room for: an axis that is short beside the others has few."""
+    spans = {letter: abs(float(np.ptp(getattr(ax, f"get_{letter}lim")()))) for letter in "xyz"}
+    for letter, span in spans.items():
+        room = round(6 * span / max(spans.values()))
+        ax.locator_params(axis=letter, nbins=max(1, room))
+        if room < 2:
+            low, high = sorted(getattr(ax, f"get_{letter}lim")())
+            marks = [m for m in getattr(ax, f"get_{letter}ticks")() if low <= m <= high]
+            getattr(ax, f"set_{letter}ticks")(sorted({marks[0], marks[-1]}) if marks else [])
+        getattr(ax, f"{letter}axis").labelpad = 14
+
+
+def figure_png(path: str | Path, figure: Figure) -> tuple[str, ...]:
     """A figure as PNG, atomically; scatter, scatter3d, bar and heatmap traces on one pair of axes.
 
+    Returns what overlaps in the drawing, in words (`overlaps`): empty where everything can be read.
     Raises EngineMissingError where matplotlib is not installed.
     """
     plt = _pyplot()
@@ -235,11 +256,13 @@ def figure_png(path: str | Path, figure: Figure) -> None:
             _decorate(ax, figure.layout)
         if solid:
             ax.set_aspect("equal")
-            ax.locator_params(axis="z", nbins=3)
+            _space_marks(ax)
         ax.set_title(figure.title)
-        if ax.get_legend_handles_labels()[1]:
-            ax.legend(fontsize=8)
+        handles, labels = ax.get_legend_handles_labels()
+        if labels:  # beside the axes: inside it would hide what is drawn
+            fig.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 4), fontsize=8)
         with atomic_file(path) as temporary:
             fig.savefig(temporary, dpi=DPI, format="png", bbox_inches="tight" if equal else None)
+        return overlaps(fig)
     finally:
         plt.close(fig)
