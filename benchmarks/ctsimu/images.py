@@ -111,6 +111,18 @@ def write(
         quiet = replace(run.detector, snr=math.inf)
         empty = expose(np.ones(run.scanner.shape), quiet, run.scanner, seed=run.seed, frame=0)
         tifffile.imwrite(folder / f"{name}_flat.tif", empty[::-1])
+    return write_metadata(folder, name, run.scanner, flat=flat)
+
+
+def write_drawn(folder: Path, name: str, scanner: Scanner, share: np.ndarray) -> str:
+    """The metadata file of an image that no simulator made; share: of the empty beam, rows from the top."""
+    tifffile.imwrite(folder / f"{name}.tif", np.rint(WHITE * share).astype(np.uint16))
+    tifffile.imwrite(folder / f"{name}_flat.tif", np.full(scanner.shape, round(WHITE), np.uint16))
+    return write_metadata(folder, name, scanner, flat=True)
+
+
+def write_metadata(folder: Path, name: str, scanner: Scanner, *, flat: bool) -> str:
+    """The toolbox's description of NAME.tif and NAME_flat.tif; its path."""
     metadata = {
         "file": {"file_type": "CTSimU Metadata", "file_format_version": {"major": 1, "minor": 2}},
         "output": {
@@ -121,8 +133,8 @@ def write(
                 "byteorder": "little",
                 "headersize": {"file": 0, "image": 0},
                 "dimensions": {
-                    "x": {"value": run.scanner.n_u, "unit": "px"},
-                    "y": {"value": run.scanner.n_v, "unit": "px"},
+                    "x": {"value": scanner.n_u, "unit": "px"},
+                    "y": {"value": scanner.n_v, "unit": "px"},
                 },
                 "max_intensity": WHITE,
                 "dark_field": {"number": 0, "filename": None, "projections_corrected": False},

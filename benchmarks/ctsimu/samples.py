@@ -31,6 +31,8 @@ STEP = 1000 / 11
 """Height of a step in the image, px."""
 HOLES = ((-160, -140), *((y, z) for z in (205, 0, -205) for y in (205, 0, -205)))
 """Centres (y, z) of the holes' shadows on the panel before scanner and foil are turned, mm; the first hole is large."""
+HOLE_RADII = (20.0, 10.0)
+"""Radii of the shadows of the large and of a small hole, mm."""
 EDGE_ANGLE = math.radians(3)
 LEFT, RIGHT = 440.0, 575.0
 """Sides of the wedges in the image, px: the tests look at x = 450 to 565, and a narrow wedge is imaged faster."""
@@ -57,6 +59,20 @@ def hole_foil(content: Mapping[str, Any]) -> TriangleMesh:
     _, axes = sample_pose(content["samples"][0]["position"], "sample")
     placed = np.column_stack([U, V, np.cross(U, V)])
     return foil.placed(R=(STAGE_TO_M @ axes).T @ placed)
+
+
+def drawn_holes(scanner: Scanner) -> np.ndarray:
+    """2D-HS-1 without a simulator: share of each pixel (rows from the top, columns) inside circles at `HOLES`.
+
+    Lengths count from the panel's centre, x to the right (-y of the world), y down (-z).
+    """
+    x = (np.arange(scanner.n_u) + 0.5 - scanner.n_u / 2) * scanner.p_u
+    y = (np.arange(scanner.n_v) + 0.5 - scanner.n_v / 2) * scanner.p_v
+    share = np.zeros(scanner.shape)
+    for k, (y_W, z_W) in enumerate(HOLES):
+        distance = np.hypot(x[None] + y_W, y[:, None] + z_W)
+        share += np.clip(0.5 + (HOLE_RADII[min(k, 1)] - distance) / scanner.p_u, 0.0, 1.0)
+    return share
 
 
 def duplex_wires() -> TriangleMesh:

@@ -14,6 +14,8 @@ from typing import Any
 
 from tomopose.values import value
 
+MEASUREMENT = "measurement"
+"""The argument that holds what a project file says for its reports: machine, operator, certificates."""
 DEPENDENCIES = ("numpy", "scipy", "numba", "tifffile", "h5py")
 
 

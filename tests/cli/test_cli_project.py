@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import h5py
@@ -15,6 +16,9 @@ from tomopose.cli.simulated import RADIOGRAPHS, write_run
 from tomopose.errors import FileError, InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import convention_from_rotation
+from tomopose.simulation.objects.mesh import write_stl
+from tomopose.simulation.objects.shapes import Solid, box
+from tomopose.simulation.objects.tessellate import tessellate
 
 SCANNER = tp.Scanner(d_SD=1500.0, d_SR=555.0, p_u=0.4, p_v=0.4, u_0=90.0, v_0=101.0, n_u=181, n_v=203)
 NOTES = "d_SD_mm = 1500\nd_SR_mm = 555\np_u_mm = 0.4\np_v_mm = 0.4\nn_u_px = 181\nn_v_px = 203\n"
@@ -129,6 +133,70 @@ def test_a_verb_takes_from_the_project_what_its_options_do_not_say(project, caps
     report = (project.folder / "cal" / "report.html").read_text()
     for fact in ("CT 3", "A. Example", "20.1 deg C"):
         assert fact in report
+
+
+CERTIFICATE = """machine = "CT 3"
+serial = "SN-4711"
+operator = "A. Example"
+ball_certificate = "K-118"
+temperature_C = "20.1"
+valid_until = "2027-03-31"
+"""
+STATED = ("CT 3", "SN-4711", "A. Example", "K-118", "20.1", "2027-03-31")
+"""What must be readable in every report."""
+
+
+@pytest.fixture
+def three(project):
+    """A project with all fields of a certificate, and three calibrations made under it."""
+    toml = project.folder / "tomopose.toml"
+    toml.write_text('scanner = "scanner.json"\nposes = "poses.csv"\nball_diameter_mm = 8.0\n' + CERTIFICATE)
+    rng = np.random.default_rng(1)
+    seen = tp.read_observations(project.folder / "observations.csv")
+    for k in range(3):
+        moved = dataclasses.replace(seen, x_D=seen.x_D + 0.01 * rng.standard_normal(seen.x_D.shape))
+        tp.write_observations(project.folder / f"run{k}.csv", moved)
+        assert run(["calibrate", "--observations", f"run{k}.csv", "--out", f"cal{k}", "--quiet"]) in (0, 3)
+    return project
+
+
+def test_the_fields_of_a_certificate_are_in_every_report(three):
+    for k in range(3):
+        words = ["monitor", "history.jsonl", "--add", f"cal{k}/calibration.json", "--out", "history.html", "--quiet"]
+        assert run(words) in (0, 3)
+    cal = ["--calibration", "cal0/calibration.json"]
+    assert run(["compare", "cal0/calibration.json", "cal1/calibration.json", "--out", "change.html", "--quiet"]) in (
+        0,
+        3,
+    )
+    write_stl(three.folder / "part.stl", tessellate((Solid(shape=box(18.0, 14.0, 5.0), material="Al"),))[0][0])
+    part = ["--part", "part.stl", "--mu-per-mm", "0.1", "--views", "6", "--out", "scan.csv", "--quiet"]
+    assert run(["plan", "scan", *part]) == 0
+    (three.folder / "matrices").mkdir()
+    assert run(["matrices", *cal, "--poses", "scan.csv", "--out", "matrices/matrices.npz", "--quiet"]) in (0, 3)
+    (three.folder / "found").mkdir()
+    (three.folder / "run0.csv").rename(three.folder / "found" / "observations.csv")
+    for folder in ("cal0", "matrices", "found"):
+        out = ["--out", f"{folder}/again.html", "--certificate", "paper"] if folder == "cal0" else []
+        assert run(["report", folder, *out, "--quiet"]) == 0
+    pages = ["cal0/report.html", "cal0/again.html", "paper/certificate.html", "history.html", "change.html"]
+    for page in (*pages, "scan.html", "matrices/report.html", "found/report.html"):
+        text = (three.folder / page).read_text()
+        assert [fact for fact in STATED if fact not in text] == [], page
+    assert three.json("scan.json")["provenance"]["arguments"]["measurement"]["serial"] == "SN-4711"
+
+
+def test_a_report_takes_the_project_that_is_named_and_a_result_keeps_what_it_was_made_with(three, tmp_path_factory):
+    other = tmp_path_factory.mktemp("other") / "b.toml"
+    other.write_text('machine = "CT 9"\n')
+    assert run(["report", "cal0", "--out", "kept.html", "--project", str(other), "--quiet"]) == 0
+    text = (three.folder / "kept.html").read_text()
+    assert "CT 3" in text
+    assert "CT 9" not in text
+    (three.folder / "found").mkdir()
+    (three.folder / "run0.csv").rename(three.folder / "found" / "observations.csv")
+    assert run(["report", "found", "--project", str(other), "--quiet"]) == 0
+    assert "CT 9" in (three.folder / "found" / "report.html").read_text()
 
 
 def test_options_win_and_another_project_can_be_named(project, tmp_path_factory, capsys):

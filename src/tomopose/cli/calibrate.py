@@ -204,7 +204,7 @@ def made_by(
 
     facts: what the project file says for reports.
     """
-    from tomopose.provenance import provenance
+    from tomopose.provenance import MEASUREMENT, provenance
 
     made = provenance(
         inputs=[p for p in (o.scanner, o.poses, o.observations, o.manipulator, o.twin, o.source_poses, o.review) if p],
@@ -220,7 +220,7 @@ def made_by(
             from_pose=o.from_pose,
             until_pose=o.until_pose,
         )
-        | ({"measurement": dict(facts)} if facts else {}),
+        | ({MEASUREMENT: dict(facts)} if facts else {}),
     )
     return replace(result, provenance=replace(made, time_utc=decisions[-1].when) if decisions else made)
 

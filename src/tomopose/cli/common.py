@@ -9,11 +9,14 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from tomopose.provenance import Provenance
 
 OK, BAD_INPUT, USAGE, NOT_TRUSTWORTHY, MISSING, INTERNAL = 0, 1, 2, 3, 4, 70
 INTERRUPTED, TERMINATED = 130, 143
@@ -175,7 +178,15 @@ def names(text: str | None) -> tuple[str, ...]:
 def arguments(**values: object) -> dict[str, Any]:
     """The arguments of a verb for the provenance: paths by their names alone, and the project's facts for reports."""
     from tomopose.cli.project import current_facts
+    from tomopose.provenance import MEASUREMENT
 
     said = {k: v.name if isinstance(v, Path) else v for k, v in values.items() if v is not None}
     facts = current_facts()
-    return {**said, "measurement": facts} if facts else said
+    return {**said, MEASUREMENT: facts} if facts else said
+
+
+def with_facts(made: Provenance) -> Provenance:
+    """The provenance of an earlier result, with the project's facts where it says nothing of the machine."""
+    from tomopose.provenance import MEASUREMENT
+
+    return made if MEASUREMENT in made.arguments else replace(made, arguments={**made.arguments, **arguments()})

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from tomopose.cli.common import NOT_TRUSTWORTHY, OK, ForceOption, JsonOption, QuietOption, Say
+from tomopose.cli.common import NOT_TRUSTWORTHY, OK, ForceOption, JsonOption, QuietOption, Say, arguments
 
 EPILOG = "Example: tomopose compare before/calibration.json after/calibration.json --out change.html"
 
@@ -31,6 +32,7 @@ def compare(
     """
     import tomopose as tp
     from tomopose.files import require_absent
+    from tomopose.provenance import provenance, sha256
     from tomopose.report import comparison_report, write_report
     from tomopose.units import value_with_uncertainty
 
@@ -39,7 +41,9 @@ def compare(
         require_absent(out, force=force)
     found = tp.compare(tp.read_calibration(a), tp.read_calibration(b))
     if out is not None:
-        write_report(out, comparison_report(found, labels=(str(a), str(b))))
+        # By their paths: both files are commonly called calibration.json.
+        made = replace(provenance(arguments=arguments()), inputs={str(path): sha256(path) for path in (a, b)})
+        write_report(out, comparison_report(found, labels=(str(a), str(b)), provenance=made))
     changes = [
         f"  {name:<10} {value_with_uncertainty(float(d), float(u))}   z = {z:+.1f}"
         for name, d, u, z in zip(found.names, found.difference, found.u, found.z, strict=True)

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tomopose.cli.common import NOT_TRUSTWORTHY, OK
+from tomopose.cli.common import NOT_TRUSTWORTHY, OK, arguments
 from tomopose.cli.options import SpokenOptions, add_command
 
 EPILOG = (
@@ -59,6 +59,7 @@ def monitor(options: Options) -> int:
     from tomopose.calibration.records.history import history_entry, read_history, with_entry, write_history
     from tomopose.calibration.records.monitor import monitor as judge
     from tomopose.errors import InputError
+    from tomopose.provenance import provenance
     from tomopose.report import history_report, write_report
 
     o = options
@@ -74,7 +75,10 @@ def monitor(options: Options) -> int:
     found = judge(entries, baseline=o.baseline)
     drawn = o.out is not None and len(entries) >= 3
     if o.out is not None and drawn:
-        write_report(o.out, history_report(entries, baseline=o.baseline))
+        read = [path for path in (o.history, o.add) if path is not None and path.exists()]
+        asked = arguments(label=o.label or None, machine=o.machine or None, baseline=o.baseline)
+        made = provenance(inputs=read, arguments=asked)
+        write_report(o.out, history_report(entries, baseline=o.baseline, provenance=made))
     if o.add is not None:
         write_history(o.history, entries)
     if o.out is not None and not drawn:

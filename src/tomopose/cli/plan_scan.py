@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from tomopose.cli.common import OK
+from tomopose.cli.common import OK, arguments
 from tomopose.cli.options import WritingOptions
 from tomopose.cli.plan_poses import SUFFIXES
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from tomopose.planning.part.settings import PartSettings
     from tomopose.planning.part_scan.freedoms import Freedom, Placing
     from tomopose.planning.part_scan.plan import PartScanPlan
+    from tomopose.provenance import Provenance
     from tomopose.report.pages.scan_plan_page import ScanPlanFigures
     from tomopose.trajectory.scan import Wave
 
@@ -324,6 +325,15 @@ def _fdk(plan: PartScanPlan) -> tuple[dict[str, object], str]:
     return {"possible": not why, "why": why}, words
 
 
+def _made(o: Options) -> Provenance:
+    """What the plan was made from, and what the project file says for its report."""
+    from tomopose.provenance import provenance
+
+    files = (o.part, o.scanner, o.calibration, o.limits, o.features, o.manipulator, o.scene)
+    asked = arguments(views=o.views, material=o.material, kv=o.kv, mu_per_mm=o.mu)
+    return provenance(inputs=[path for path in files if path is not None], arguments=asked, seed=o.seed)
+
+
 def _write(o: Options, plan: PartScanPlan, attenuation: str, free: Sequence[Freedom], placing: Placing | None) -> None:
     """Write all files of a planned scan and say what it reaches."""
     import tomopose as tp
@@ -340,10 +350,11 @@ def _write(o: Options, plan: PartScanPlan, attenuation: str, free: Sequence[Free
     document["placing"] = None if placing is None else placing.document()
     mesh = plan.goal.part.mesh
     surface = PartSurface.of(mesh.points, mesh.faces, plan.goal.x, plan.chosen.seen)
-    page = scan_plan_report(cast("ScanPlanFigures", document), surface, plan.source_path)
+    made = _made(o)
+    page = scan_plan_report(cast("ScanPlanFigures", document), surface, plan.source_path, provenance=made)
     paths = _beside(o)
     tp.write_poses(paths[0], plan.poses, force=o.force)
-    write_json(paths[1], "scan-plan", document)
+    write_json(paths[1], "scan-plan", {**document, "provenance": made.to_json()})
     write_report(paths[2], page)
     if plan.way is not None:
         tp.write_poses(paths[3], plan.machine.poses(plan.way), force=o.force)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import importlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +69,10 @@ OF_VERB: Mapping[tuple[str, str], str | None] = {
     ("simulate", "--workers"): None,
 }
 """(Verb, option) -> key where a verb's option means something else; None: the option takes nothing from the file."""
-WITHOUT = ("init", "doctor", "demo", "study", "report", "import-geometry")
+WITHOUT = ("init", "doctor", "demo", "study", "import-geometry")
 """Verbs that take nothing from a project file."""
+FACTS_ALONE = ("report",)
+"""Verbs that take from it what appears in reports, and no defaults: a folder of results says what it was made from."""
 AGAINST: Mapping[str, tuple[str, ...]] = {"images": ("--observations",), "manipulator": ("--twin",)}
 """Keys that an option excludes."""
 
@@ -127,7 +129,8 @@ def project_for(words: Sequence[str], named: str | None) -> Project | None:
     verb = next((word for word in words if not word.startswith("-")), "")
     if verb in WITHOUT or not verb or "--help" in words:
         return None
-    return find_project(named, Path.cwd())
+    project = find_project(named, Path.cwd())
+    return replace(project, values={}) if project is not None and verb in FACTS_ALONE else project
 
 
 def default_map(command: Any, project: Project | None, words: Sequence[str], verb: str = "") -> dict[str, Any]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tomopose.cli.common import OK, ForceOption, JsonOption, QuietOption, Say
+from tomopose.cli.common import OK, ForceOption, JsonOption, QuietOption, Say, arguments, with_facts
 
 if TYPE_CHECKING:
     from tomopose import Calibration
@@ -52,6 +53,8 @@ def report(
     from tomopose.cli.job import image_source, open_for, worst
     from tomopose.errors import FileError
     from tomopose.files import require_absent
+    from tomopose.io.matrices_npz import read_matrices_provenance
+    from tomopose.provenance import provenance
     from tomopose.report import calibration_report, matrices_report, observations_report, write_report
     from tomopose.report.printing import write_pdf
 
@@ -61,6 +64,8 @@ def report(
     observations = tp.read_observations(observations_file) if observations_file.exists() else None
     sequence = None if poses is None else tp.read_poses(poses)
     calibration = tp.read_calibration(calibration_file) if calibration_file.exists() else None
+    if calibration is not None and calibration.provenance is not None:
+        calibration = replace(calibration, provenance=with_facts(calibration.provenance))
     pictures: tuple[Any, ...] = ()
     if images is not None and observations is not None and calibration is not None and sequence is not None:
         stack = open_for(say, image_source(images), calibration.scanner, sequence)
@@ -77,9 +82,12 @@ def report(
             decisions=read_decisions(folder / "decisions.jsonl") if (folder / "decisions.jsonl").exists() else (),
         )
     elif observations is not None:
-        html = observations_report(observations)
+        made = provenance(inputs=[observations_file], arguments=arguments())
+        html = observations_report(observations, provenance=made)
     elif (folder / "matrices.npz").exists():
-        html = matrices_report(tp.read_matrices(folder / "matrices.npz"))
+        matrices_file = folder / "matrices.npz"
+        made = read_matrices_provenance(matrices_file) or provenance(inputs=[matrices_file])
+        html = matrices_report(tp.read_matrices(matrices_file), provenance=with_facts(made))
     else:
         raise FileError(f"{folder} holds no calibration.json, observations.csv or matrices.npz", path=folder)
     written = [target, *(() if pdf is None else (require_absent(pdf, force=force),))]
@@ -96,15 +104,14 @@ def report(
 
 def write_certificate(folder: Path, calibration: Calibration, *, pdf: bool, force: bool) -> list[Path]:
     """certificate.html, certificate.xml and, where it is asked for, certificate.pdf; the files written."""
-    from tomopose.cli.project import NAME, read_project
+    from tomopose.cli.project import current_facts
     from tomopose.files import atomic_folder, write_text
     from tomopose.report.certificate.content import certificate_of
     from tomopose.report.certificate.dcc import dcc_xml
     from tomopose.report.certificate.page import certificate_report
     from tomopose.report.printing import write_pdf
 
-    facts = read_project(Path(NAME)).facts if Path(NAME).is_file() else None
-    content = certificate_of(calibration, facts)
+    content = certificate_of(calibration, current_facts() or None)
     html = certificate_report(content)
     names = ["certificate.html", "certificate.xml", *(["certificate.pdf"] if pdf else [])]
     with atomic_folder(folder, force=force) as place:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from tomopose.calibration.result import Calibration
 from tomopose.errors import InputError
+from tomopose.provenance import MEASUREMENT
 from tomopose.report.words import meaning
 
 NOT_STATED = "not stated"
@@ -86,7 +87,7 @@ def certificate_of(calibration: Calibration, facts: Mapping[str, str] | None = N
         )
     if made is None:
         raise InputError("the calibration has no provenance, so that nobody can say what a certificate would be of")
-    said = facts if facts is not None else made.arguments.get("measurement", {})
+    said = facts if facts is not None else made.arguments.get(MEASUREMENT, {})
     results = tuple(
         Line(name=p.name, meaning=meaning(p.name), value=p.value, U=K * p.u, unit=p.unit)
         for p in calibration.parameters

@@ -13,8 +13,10 @@ from tomopose.calibration.records.history import Entry
 from tomopose.calibration.records.monitor import Monitoring, monitor
 from tomopose.coverage import K2, expanded_k2
 from tomopose.errors import InputError
+from tomopose.provenance import Provenance
 from tomopose.report.page import CARE, GOOD, Block, Figure, Page, Section, Table, Verdict, render
 from tomopose.report.sections.checks import probability
+from tomopose.report.sections.provenance import provenance_section
 from tomopose.report.style import ACCENT, ALERT, LINE, SOFT, axis, layout
 from tomopose.report.words import meaning, number, small_unit, symbol
 from tomopose.units import MICROMETRES_PER_MM, MICRORADIANS_PER_RAD
@@ -69,7 +71,11 @@ def compared_figure(comparison: Comparison) -> Figure:
 
 
 def comparison_report(
-    comparison: Comparison, *, labels: tuple[str, str] = ("A", "B"), title: str = "Two calibrations compared"
+    comparison: Comparison,
+    *,
+    labels: tuple[str, str] = ("A", "B"),
+    provenance: Provenance | None = None,
+    title: str = "Two calibrations compared",
 ) -> str:
     """One offline HTML document about the change from one calibration to another: the questions of the paper's table 2.
 
@@ -97,7 +103,10 @@ def comparison_report(
             title=title,
             subtitle=f"{labels[0]} → {labels[1]}",
             verdict=verdict,
-            sections=[Section(title="What changed", blocks=[table, compared_figure(comparison)])],
+            sections=[
+                Section(title="What changed", blocks=[table, compared_figure(comparison)]),
+                provenance_section(provenance),
+            ],
             footer="Written by tomopose.",
         )
     )
@@ -190,7 +199,11 @@ def history_verdict(found: Monitoring) -> Verdict:
 
 
 def history_report(
-    entries: Sequence[Entry], *, title: str = "Calibrations over time", baseline: str | None = None
+    entries: Sequence[Entry],
+    *,
+    title: str = "Calibrations over time",
+    baseline: str | None = None,
+    provenance: Provenance | None = None,
 ) -> str:
     """One offline HTML document with the answer of the rules and control charts.
 
@@ -225,7 +238,7 @@ def history_report(
             title=title,
             subtitle=f"{len(entries)} calibrations, {entries[0]['time_utc']} to {entries[-1]['time_utc']}",
             verdict=history_verdict(found),
-            sections=[section, Section(title="All entries", blocks=[table])],
+            sections=[section, Section(title="All entries", blocks=[table]), provenance_section(provenance)],
             footer="Written by tomopose. Bars are expanded uncertainties, k = 2.",
         )
     )

@@ -8,7 +8,9 @@ from typing import Any, TypedDict
 
 import numpy as np
 
+from tomopose.provenance import Provenance
 from tomopose.report.page import CARE, GOOD, Block, Figure, KeyFigure, Page, Section, Table, Verdict, Words, render
+from tomopose.report.sections.provenance import provenance_section
 from tomopose.report.style import ACCENT, SEQUENTIAL, axis, colour_bar, layout, space_axis
 from tomopose.report.words import number
 from tomopose.units import Array
@@ -94,7 +96,9 @@ class PartSurface:
         return cls(points=points, faces=kept, views=np.where(np.isfinite(distance), found, np.nan))
 
 
-def scan_plan_report(document: ScanPlanFigures, surface: PartSurface, source_path: Array) -> str:
+def scan_plan_report(
+    document: ScanPlanFigures, surface: PartSurface, source_path: Array, *, provenance: Provenance | None = None
+) -> str:
     """One offline HTML document of scan.json, the part's surface, and the source's path (n, 3), mm, about the part."""
     ratio, best = document["certificate"]["ratio"], max(p["J"] for p in document["paths"].values())
     gain = document["J"] / best - 1 if best > 0 else float("inf")
@@ -129,6 +133,7 @@ def scan_plan_report(document: ScanPlanFigures, surface: PartSurface, source_pat
                 ),
                 Section(title="What limits it", lead="Each freedom was tried by itself.", blocks=_limits(document)),
                 Section(title="Definitions", blocks=[_constants(document)]),
+                provenance_section(provenance),
             ],
             footer="Written by tomopose.",
         )

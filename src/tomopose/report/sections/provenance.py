@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from tomopose.provenance import Provenance
+from tomopose.provenance import MEASUREMENT, Provenance
 from tomopose.report.page import Block, Section, Table, Words
 from tomopose.report.words import NOT_GIVEN, cell
-
-MEASUREMENT = "measurement"
-"""The argument that holds what a project file says for its reports."""
 
 
 def provenance_section(provenance: Provenance | None) -> Section:
