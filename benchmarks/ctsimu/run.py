@@ -76,7 +76,7 @@ def plain_numbers() -> Iterator[None]:
 
 @contextlib.contextmanager
 def one_analytical_image() -> Iterator[None]:
-    """2D-WE-2 calculates the same analytical image, pixel by pixel, for every run: for the time of the test it is kept."""
+    """2D-WE-2 calculates its analytical image anew for every run, pixel by pixel; meanwhile it is kept."""
     calculate = Geometry.create_detector_flat_field_sphere
     kept: list[tuple[object, ...]] = []
 
