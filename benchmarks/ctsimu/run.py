@@ -289,7 +289,7 @@ def scintillators(place: Place) -> list[Row]:
         if key.startswith("D1"):
             continue
         off = ours[key] - bars[key]
-        lower, upper = (bars[c] for c in bars if c.startswith(key) and c != key)
+        lower, upper = (bars[f"u_{side}({key})"] for side in ("lower", "upper"))
         worst = np.abs(off / np.where(off < 0, lower, upper)).max()
         rows.append(
             Row(

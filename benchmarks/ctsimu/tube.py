@@ -3,9 +3,10 @@
 The scenarios of the toolbox state the tube of the other tests: tungsten, electrons in and beam out at 45 degrees, a
 window of 4 mm of aluminium. They name spectrum files that are not published, and the model that made them is not
 published as code. The models of spekpy at 45 degrees differ by more than these tests allow, so that the stated angle
-does not determine a spectrum. Two numbers are therefore determined from one reference: anode angle and thickness of the
-aluminium window for which spekpy's spectrum of 200 kV gives the Monte Carlo ratios between the steps of the aluminium
-wedge without filter. The references of iron, of both wedges behind copper and of the scintillators play no part in it.
+does not determine a spectrum. For each voltage two numbers are therefore determined from one reference: anode angle and
+thickness of the aluminium window for which spekpy's spectrum gives the Monte Carlo ratios between the steps of the
+aluminium wedge, without filter, before the ideal detector. The references of iron, of both wedges behind copper and of
+the scintillators play no part in it.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
+from ctsimu.evaluation.test2D_SW_1 import Test2D_SW_1_results
 from ctsimu.evaluation.test2D_SW_2 import Test2D_SW_2_results
 from images import wedge_materials
 from samples import ALUMINIUM
@@ -22,7 +24,7 @@ from scipy.optimize import minimize_scalar
 from tomopose.simulation.physics.materials import attenuation
 from tomopose.simulation.physics.spectrum import Spectrum, tube_spectrum
 
-ANGLES, WINDOWS = (6.0, 30.0), (0.5, 8.0)
+ANGLES, WINDOWS = (2.0, 30.0), (0.5, 8.0)
 """Where anode angle (deg) and window (mm Al) are sought."""
 
 
@@ -38,6 +40,11 @@ class TubeModel:
         return bare.filtered("Al", self.window, wedge_materials())
 
 
+REFERENCES = {
+    120.0: (Test2D_SW_1_results, "09_Al_noFilter_120kV-poly_Ideal"),
+    200.0: (Test2D_SW_2_results, "01_Al_noFilter_200kV-poly_Ideal"),
+}
+"""For each voltage, kV: the toolbox's class and the name of its reference."""
 DETECTORS: dict[str, tuple[str, float] | None] = {
     "D1": None,
     "D2": ("CsI", 0.2),
@@ -50,7 +57,7 @@ def spectrum(voltage: float, *, mono: bool, copper: float = 0.0) -> Spectrum:
     """Photons of the tube behind its window and, where asked for, a copper filter (mm); or of one energy."""
     if mono:
         return Spectrum(energy=np.array([voltage]), weight=np.ones(1))
-    made = tube_model().photons(voltage)
+    made = tube_model(voltage).photons(voltage)
     return made.filtered("Cu", copper, wedge_materials()) if copper else made
 
 
@@ -62,22 +69,24 @@ def seen_by(photons: Spectrum, detector: str) -> Spectrum:
 
 
 @functools.cache
-def tube_model() -> TubeModel:
-    """Least sum of squared deviations from the reference's ratios, in units of its error bars."""
-    reference = Test2D_SW_2_results()
-    reference.loadReference("01_Al_noFilter_200kV-poly_Ideal")
-    wanted = np.array(reference.ratios_mc_primary)
-    bars = np.array(reference.error_ratios_mc_primary_lower) + np.array(reference.error_ratios_mc_primary_upper)
+def tube_model(voltage: float) -> TubeModel:
+    """Least sum of squared deviations from the reference's ratios of steps, in units of its error bars."""
+    reference, name = REFERENCES[voltage]
+    read = reference()
+    read.loadReference(name)
+    grey, error = np.array(read.means_mc_primary), np.array(read.error_mc_primary_upper)
+    wanted = grey[1:] / grey[:-1]
+    bars = wanted * (error[1:] / grey[1:] + error[:-1] / grey[:-1])
     lengths = np.array([*ALUMINIUM, 0.0])
 
     @functools.cache
     def best_window(angle: float) -> tuple[float, float]:
-        felt = seen_by(tube_spectrum(200.0, anode_angle_deg=angle), "D1")
+        felt = seen_by(tube_spectrum(voltage, anode_angle_deg=angle), "D1")
         mu = attenuation("Al", felt.energy, materials=wedge_materials())
 
         def misfit(window: float) -> float:
-            grey = np.exp(-np.outer(lengths + window, mu)) @ felt.weight
-            return float(np.sum(((grey[1:] / grey[:-1] - wanted) / bars) ** 2))
+            ours = np.exp(-np.outer(lengths + window, mu)) @ felt.weight
+            return float(np.sum(((ours[1:] / ours[:-1] - wanted) / bars) ** 2))
 
         best = minimize_scalar(misfit, bounds=WINDOWS, method="bounded")
         return float(best.fun), float(best.x)
