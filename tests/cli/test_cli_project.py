@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
+import shutil
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -89,24 +92,39 @@ def nexus(path, made):
         file["entry/sample/rotation_angle"].attrs["units"] = "degree"
 
 
+STARTS = {
+    "PI hexapod": {"scanner.txt": lambda _: NOTES, "positions.log": pi_log},
+    "KUKA robot": {"scanner.txt": lambda _: NOTES, "run.dat": kuka_dat},
+    "Nikon scanner": {"part.xtekct": lambda _: XTEKCT, "points.csv": german_csv},
+    "NXtomo": {"positions.log": pi_log},
+}
+"""The starts of docs/howto/init.md, and the files that each has beside its images."""
+
+
+def commands_of(start):
+    """The words of the commands that the documentation gives for a start."""
+    text = (Path(__file__).resolve().parents[2] / "docs" / "howto" / "init.md").read_text(encoding="utf-8")
+    block = re.search(rf"^{start}[^`]*```\n(.*?)```", text, flags=re.MULTILINE | re.DOTALL)
+    assert block is not None, start
+    return [line.split()[1:] for line in block[1].splitlines()]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("start", ["PI", "KUKA", "Nikon and csv", "NXtomo"])
-def test_two_commands_lead_from_the_files_that_people_have_to_a_report(start, made, tmp_path, monkeypatch, capsys):
-    """None of them has more than four options."""
+@pytest.mark.parametrize("start", STARTS)
+def test_the_documented_commands_lead_from_the_files_that_people_have_to_a_report(
+    start, made, tmp_path, monkeypatch, capsys
+):
+    """At most three commands, none of them with more than four options."""
     folder, poses = made
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "scanner.txt").write_text(NOTES)
-    (tmp_path / "part.xtekct").write_text(XTEKCT)
-    log = {"PI": "positions.log", "KUKA": "run.dat", "Nikon and csv": "Punkte.csv", "NXtomo": "positions.log"}[start]
-    text = {"run.dat": kuka_dat, "Punkte.csv": german_csv}.get(log, pi_log)(poses)
-    (tmp_path / log).write_text(text)
-    scanner = {"Nikon and csv": "part.xtekct", "NXtomo": "scan.nxs"}.get(start, "scanner.txt")
-    first = ["init", "--from", scanner, "--from", log, "--ball-diameter-mm", "8"]
+    for name, text in STARTS[start].items():
+        (tmp_path / name).write_text(text(poses))
     if start == "NXtomo":
         nexus(tmp_path / "scan.nxs", folder)
     else:
-        first += ["--images", str(folder / RADIOGRAPHS)]
-    commands = [first, ["calibrate", "--out", "cal"]]
+        shutil.copytree(folder / RADIOGRAPHS, tmp_path / "radiographs")
+    commands = commands_of(start)
+    assert len(commands) <= 3
     assert all(sum(word.startswith("--") for word in words) <= 4 for words in commands)
     codes = [run(words) for words in commands]
     assert codes[0] == 0, capsys.readouterr().err
@@ -160,6 +178,7 @@ def three(project):
     return project
 
 
+@pytest.mark.slow
 def test_the_fields_of_a_certificate_are_in_every_report(three):
     for k in range(3):
         words = ["monitor", "history.jsonl", "--add", f"cal{k}/calibration.json", "--out", "history.html", "--quiet"]
@@ -186,6 +205,7 @@ def test_the_fields_of_a_certificate_are_in_every_report(three):
     assert three.json("scan.json")["provenance"]["arguments"]["measurement"]["serial"] == "SN-4711"
 
 
+@pytest.mark.slow
 def test_a_report_takes_the_project_that_is_named_and_a_result_keeps_what_it_was_made_with(three, tmp_path_factory):
     other = tmp_path_factory.mktemp("other") / "b.toml"
     other.write_text('machine = "CT 9"\n')
