@@ -8,8 +8,8 @@ import pytest
 import tomopose as tp
 from tomopose.engines.cpu import CpuEngine
 from tomopose.geometry.rotations import R_x, R_z
-from tomopose.refinement.derivatives import integrals_with_derivatives
-from tomopose.refinement.motions import composed, gauge, motions_of, transforms, without_gauge
+from tomopose.refinement.joint_fit.derivatives import integrals_with_derivatives
+from tomopose.refinement.joint_fit.motions import composed, gauge, motions_of, transforms, without_gauge
 
 GRID = tp.VoxelGrid(shape=(23, 21, 26), spacing=[0.9, 1.1, 1.0], centre=[0.7, -0.4, 1.3])
 

@@ -8,8 +8,8 @@ from enum import Enum
 import numpy as np
 
 from tomopose.engines.cpu import CpuEngine
-from tomopose.refinement.fit import Fit, State, blank, lines_of, matrices_of, residual_of
-from tomopose.refinement.measured import Measured
+from tomopose.refinement.joint_fit.fit import Fit, State, blank, lines_of, matrices_of, residual_of
+from tomopose.refinement.joint_fit.measured import Measured
 from tomopose.refinement.settings import MISFIT, MISFIT_SHARE, SIGNIFICANCE
 from tomopose.units import Array, Floats
 
@@ -66,8 +66,8 @@ def trial(data: Measured, refined: State, fit: Fit) -> tuple[Trial, State, State
     single = float(np.max(gains / noise)) - 2.0
     return (
         Trial(
-            before=np.sqrt(squares[0] / count),
-            after=np.sqrt(squares[1] / count),
+            before=np.sqrt(squares[0] / count) / data.noise_left,
+            after=np.sqrt(squares[1] / count) / data.noise_left,
             gain=max(mean / max(error, 1e-30), min(single, 1e3) if mean > 0 else -np.inf),
             residual_before=residuals[0],
             residual_after=residuals[1],

@@ -18,8 +18,9 @@ import numpy as np
 
 from tomopose.units import Array
 
-LEAST = 1e-4
-"""Smallest size of a part, relative to where it began: below it a part is as good as absent."""
+LEAST = 5e-3
+"""Smallest size of a part, relative to where it began: of 1 px it leaves less than the images' own uncertainty, and the
+covariance of slow parts keeps an inverse."""
 LARGEST = 10.0
 """Largest: what was stated is not exceeded tenfold by evidence alone."""
 

@@ -17,11 +17,12 @@ from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.provenance import provenance
 from tomopose.reconstruction.line_integrals import Correction, ImagesAre, require_contrast
 from tomopose.reconstruction.run import line_integrals_of
-from tomopose.refinement.fit import Fit, State, blank, linearised
-from tomopose.refinement.joint import normal_blocks
+from tomopose.refinement.joint_fit.fit import Fit, State, blank, linearised
+from tomopose.refinement.joint_fit.linear import normal_blocks
+from tomopose.refinement.joint_fit.measured import Measured, crossed_faces, measured, rays_through
+from tomopose.refinement.joint_fit.motions import pixel_jacobian, transforms
+from tomopose.refinement.joint_fit.pyramid import finer, level_of
 from tomopose.refinement.judge import Verdict, decide, trial
-from tomopose.refinement.measured import Measured, binned, crossed_faces, finer, measured, rays_through
-from tomopose.refinement.motions import pixel_jacobian, transforms
 from tomopose.refinement.prior import Prior, scatter
 from tomopose.refinement.result import Refinement
 from tomopose.refinement.settings import DEFAULT_SIGMA_PX, LEAST_PIXELS, MOST_SAMPLES, RefineSettings
@@ -105,13 +106,13 @@ def assessed(
     """What the estimate is worth: the judgement of the held-out pixels, the uncertainty, and what is not observable."""
     data, state, prior = found.data, found.state, found.prior
     grid = data.grid
-    level = binned(data, found.judged)
+    level = level_of(data, found.judged)
     fit = Fit(precision=prior.precision, steps=3, turns=s.turns, threads=threads)
     held_out, before, after = trial(level, state, fit)
     steps.done()
     at = replace(after, q=state.q)
     here = linearised(level, at, threads=threads)
-    information = normal_blocks(here.motions, here.weighed(level.weight))
+    information = normal_blocks(here.motions, here.weighed(level))
     radius = radius_of(grid)
     left = float((level.weight > 0).mean()) / (1 - s.held_out) if found.faces else 1.0
     open_ = () if found.faces else open_directions(information, prior, radius)
@@ -184,7 +185,7 @@ def estimate(
     coarse: VoxelGrid | None = None
     faces: tuple[str, ...] = ()
     for factor in factors:
-        level = binned(data, factor)
+        level = level_of(data, factor)
         if state is None or coarse is None:
             held = Fit(precision=None, steps=1, turns=s.turns, threads=threads)
             state = held(level, blank(level))
@@ -194,7 +195,9 @@ def estimate(
                 level = without_rays(level, faces)
                 state = blank(level)
         else:
-            state = replace(state, volume=finer(state.volume, coarse, level.grid))
+            # the volume first: poses would follow what a coarse one lacks
+            held = Fit(precision=None, steps=1, turns=s.turns, threads=threads)
+            state = held(level, replace(state, volume=finer(state.volume, coarse, level.grid)))
         for _ in range(2):
             fit = Fit(precision=prior.precision, steps=max(1, s.steps // 2), turns=s.turns, threads=threads)
             state = fit(level, state)

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tomopose.refinement.fit import LEVEL_SIGMA, Linearised, State, ridge_of, with_levels
-from tomopose.refinement.joint import Linear
-from tomopose.refinement.measured import Measured
-from tomopose.refinement.motions import gauge, pixel_jacobian, without_gauge
+from tomopose.refinement.joint_fit.fit import LEVEL_SIGMA, Linearised, State, ridge_of, with_levels
+from tomopose.refinement.joint_fit.linear import Linear
+from tomopose.refinement.joint_fit.measured import Measured
+from tomopose.refinement.joint_fit.motions import gauge, pixel_jacobian, without_gauge
+from tomopose.refinement.joint_fit.precondition import passed_frequencies
 from tomopose.refinement.prior import Prior
 from tomopose.refinement.settings import UNDETERMINED
 from tomopose.units import Array
@@ -40,10 +41,11 @@ def drawn_errors(
     data: Measured, state: State, here: Linearised, prior: Prior, *, samples: int, turns: int, seed: int
 ) -> Array:
     """Errors (samples, n, 6) of the motions that noise and prior of their own size make.  here: the data at `state`."""
-    n, x, w = len(data.p), here.x, here.weighed(data.weight)
+    n, x, w = len(data.p), here.x, here.weighed(data)
     C, own = prior.covariance, prior.precision
     precision = with_levels(own)
-    linear = Linear.of(here.engine, x > 0, here.J, w, precision, ridge_of(state.volume))
+    H = passed_frequencies(data.matrices, data.grid)
+    linear = Linear.of(here.engine, x > 0, here.J, w, precision, ridge_of(state.volume), H)
     rng, root = np.random.default_rng([seed, 21]), np.linalg.cholesky(C + 1e-15 * np.trace(C) * np.eye(len(C)))
     G = gauge(data.matrices.P, np.asarray(data.grid.centre))
     sigma = np.where(w > 0, 1 / np.sqrt(np.maximum(w, 1e-30)), 0)
@@ -52,7 +54,7 @@ def drawn_errors(
         truth = np.zeros((n, 7))
         truth[:, :6] = (root @ rng.standard_normal(6 * n)).reshape(n, 6)
         truth[:, 6] = LEVEL_SIGMA * rng.standard_normal(n)
-        noise = (sigma * rng.standard_normal(sigma.shape)).astype(np.float32)
+        noise = data.smooth((sigma * rng.standard_normal(sigma.shape)).astype(np.float32))
         _, dq = linear.solve(noise, -(precision @ truth.ravel()), np.zeros_like(x), turns=turns)
         errors[k] = without_gauge(dq[:, :6], G, own)
     return errors

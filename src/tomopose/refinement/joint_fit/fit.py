@@ -9,10 +9,11 @@ import numpy as np
 
 from tomopose.engines.cpu import CpuEngine
 from tomopose.geometry.projection import ProjectionMatrices
-from tomopose.refinement.derivatives import integrals_with_derivatives
-from tomopose.refinement.joint import Linear, normal_blocks
-from tomopose.refinement.measured import Measured
-from tomopose.refinement.motions import composed, gauge, transforms, without_gauge
+from tomopose.refinement.joint_fit.derivatives import integrals_with_derivatives
+from tomopose.refinement.joint_fit.linear import Linear, normal_blocks
+from tomopose.refinement.joint_fit.measured import Measured
+from tomopose.refinement.joint_fit.motions import composed, gauge, transforms, without_gauge
+from tomopose.refinement.joint_fit.precondition import passed_frequencies
 from tomopose.units import Array, Floats
 
 LEVEL_SIGMA = 0.01
@@ -77,9 +78,9 @@ class Linearised:
         """(n, 6, N): derivatives by the motions alone."""
         return self.J[:, :6]
 
-    def weighed(self, weight: Floats) -> Floats:
+    def weighed(self, data: Measured) -> Floats:
         """The robust weights (n, N) of the residual."""
-        return robust_weights(self.r, weight, first=False)[0]
+        return robust_weights(self.r, data, first=False)[0]
 
 
 def linearised(data: Measured, state: State, *, threads: int, held: bool = False) -> Linearised:
@@ -134,26 +135,27 @@ class Fit:
         """Steps from `start` to a minimum of the joint cost, or until they are used up."""
         state = start
         if not state.volume.any():
-            state = self._step(data, state, held=True)[0]
+            state = self._step(data, state, None, held=True)[0]
+        H = passed_frequencies(data.matrices, data.grid)
         settled, taken = False, 0
         while taken < self.steps and not settled:
             taken += 1
-            state, gain = self._step(data, state, held=self.precision is None)
+            state, gain = self._step(data, state, H, held=self.precision is None)
             settled = gain < SETTLED
         return replace(state, steps=start.steps + taken, settled=settled)
 
-    def _step(self, data: Measured, state: State, *, held: bool) -> tuple[State, float]:
-        """One step with its line search, and the relative gain of the joint cost."""
+    def _step(self, data: Measured, state: State, H: Floats | None, *, held: bool) -> tuple[State, float]:
+        """One step with its line search, and the relative gain of the joint cost; H: of the preconditioner, if any."""
         n, grid, threads = len(data.p), data.grid, self.threads
         first = not state.volume.any()
         here = linearised(data, state, threads=threads, held=held)
         engine, x, r = here.engine, here.x, here.r
-        w, chi = robust_weights(r, data.weight, first=first)
+        w, chi = robust_weights(r, data, first=first)
         precision = self._precision(n, held=held)
         unknown = np.concatenate([state.q, state.offset[:, None]], axis=1)[:, 6 if held else 0 :]
         free = self._free(engine, x, w * r, first=first)
         ridge = 0.0 if first else ridge_of(state.volume)
-        linear = Linear.of(engine, free, here.J, w, precision, ridge)
+        linear = Linear.of(engine, free, here.J, w, precision, ridge, H)
         pull = precision @ unknown.ravel()
         dx, dq = linear.solve(r, pull, x, turns=2 * self.turns if first else self.turns)
 
@@ -213,17 +215,18 @@ class Fit:
         return free & ((x > 0) | (uphill > 0))
 
 
-def robust_weights(r: Floats, weight: Floats, *, first: bool) -> tuple[Floats, float]:
+def robust_weights(r: Floats, data: Measured, *, first: bool) -> tuple[Floats, float]:
     """Weights (n, N) that fit the residual's own size, and that size over the noise (rms of the pixels in use).
 
     The residual holds what voxels, scatter and hardening leave besides noise: where it is larger than the noise, the
     noise's weights would let the images outvote the prior.
     """
+    weight, noise = data.weight, data.noise_left
     used = max(int(np.count_nonzero(weight)), 1)
-    chi = float(np.sqrt(np.einsum("np,np,np->", weight, r, r, dtype=np.float64) / used))
+    chi = float(np.sqrt(np.einsum("np,np,np->", weight, r, r, dtype=np.float64) / used)) / noise
     if first:
         return weight, chi
     size = max(chi, 1.0)
-    z = np.sqrt(weight) * np.abs(r) / np.float32(size)
+    z = np.sqrt(weight) * np.abs(r) / np.float32(size * noise)
     w = weight * np.minimum(1.0, ROBUST / np.maximum(z, 1e-12)).astype(np.float32) / np.float32(size**2)
     return np.asarray(w, dtype=np.float32), chi

@@ -36,6 +36,8 @@ class Measured:
 
     p: (n, N) line integrals, pixels as [u, v], float32.  weight: (n, N), 1/variance; 0 for bad and for held-out pixels.
     judge: (n, N), the same for held-out pixels alone.  matrices, grid: binned to the same level.
+    blur: standard deviations, px along u and v, of the Gaussian that p was smoothed with; the weights stay those of the
+    unsmoothed noise, which is what the low frequencies have.
     """
 
     p: Floats
@@ -43,6 +45,25 @@ class Measured:
     judge: Floats
     matrices: ProjectionMatrices
     grid: VoxelGrid
+    blur: tuple[float, float] = (0.0, 0.0)
+
+    def smooth(self, lines: Floats) -> Floats:
+        """Lines (n, N) smoothed as `p` was."""
+        if not any(self.blur):
+            return lines
+        m = self.matrices
+        images = lines.reshape(-1, m.n_u, m.n_v)
+        return np.asarray(scipy.ndimage.gaussian_filter(images, (0.0, *self.blur), mode="nearest")).reshape(lines.shape)
+
+    @property
+    def noise_left(self) -> float:
+        """Standard deviation of white noise after the smoothing, relative to before."""
+        left = 1.0
+        for sigma in self.blur:
+            delta = np.zeros(2 * int(4 * sigma + 1) + 1)
+            delta[len(delta) // 2] = 1.0
+            left *= float(np.sum(scipy.ndimage.gaussian_filter1d(delta, sigma) ** 2)) if sigma else 1.0
+        return left**0.5
 
 
 def measured(scan: LineIntegrals, grid: VoxelGrid, *, held_out: float, seed: int) -> Measured:
@@ -101,48 +122,6 @@ def noise_variance(p: Floats, good: npt.NDArray[np.bool_]) -> Floats:
     columns = np.stack([np.ones(len(centre)), np.exp(centre)], axis=1) / level[:, None]
     law, _ = scipy.optimize.nnls(columns, np.ones(len(centre)))
     return np.asarray(np.maximum(law[0] + law[1] * np.exp(smooth), floor), dtype=np.float32)
-
-
-def binned(data: Measured, factor: int) -> Measured:
-    """Images averaged over factor x factor pixels, and a grid of voxels as much larger over the same box."""
-    if factor == 1:
-        return data
-    m, n = data.matrices, len(data.p)
-    small, shape = m.binned(factor), (n, m.n_u // factor, factor, m.n_v // factor, factor)
-
-    def blocks(flat: Floats) -> Floats:
-        images = flat.reshape(n, m.n_u, m.n_v)[:, : shape[1] * factor, : shape[3] * factor]
-        return np.asarray(images.reshape(shape))
-
-    weight, judge, p = blocks(data.weight), blocks(data.judge), blocks(data.p)
-    total = weight + judge
-    mass = total.sum(axis=(2, 4))
-    mean = (total * p).sum(axis=(2, 4)) / np.where(mass > 0, mass, 1)
-    # a coarse pixel that holds a held-out one judges; the sum of weights is that of a mean
-    apart = (judge > 0).any(axis=(2, 4))
-    cells = tuple(-(-k // factor) for k in data.grid.shape)
-    grid = VoxelGrid(shape=cells, spacing=data.grid.spacing * factor, centre=data.grid.centre)  # type: ignore[arg-type]
-    return Measured(
-        p=mean.astype(np.float32).reshape(n, -1),
-        weight=np.where(apart, 0, mass).astype(np.float32).reshape(n, -1),
-        judge=np.where(apart, mass, 0).astype(np.float32).reshape(n, -1),
-        matrices=small,
-        grid=grid,
-    )
-
-
-def finer(values: np.ndarray, coarse: VoxelGrid, fine: VoxelGrid) -> np.ndarray:
-    """A volume [z, y, x] of a coarse grid on a finer one about the same middle, by trilinear interpolation."""
-    at = np.meshgrid(
-        *(
-            ((np.arange(n) - (n - 1) / 2) * small / large + (m - 1) / 2)
-            for n, m, small, large in zip(
-                fine.shape, coarse.shape, fine.spacing[::-1], coarse.spacing[::-1], strict=True
-            )
-        ),
-        indexing="ij",
-    )
-    return np.asarray(scipy.ndimage.map_coordinates(values, at, order=1, mode="nearest"), dtype=np.float32)
 
 
 def crossed_faces(volume: np.ndarray) -> tuple[str, ...]:

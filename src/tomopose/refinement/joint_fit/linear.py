@@ -6,8 +6,8 @@ residual r, weights W, the projector A and the views' derivatives J the step min
     |W^(1/2) (r - A dx - J dq)|^2  +  (q + dq)' C^-1 (q + dq)  +  lambda |x + dx|^2.
 
 dq is eliminated exactly, with the whole precision C^-1, correlated over views:  M = J'WJ + C^-1 (Cholesky); the volume
-is found by conjugate gradients on the Schur complement  A'WA - A'WJ M^-1 J'WA + lambda, over the voxels that are free
-to move (`free`: not held at zero by the bound).
+is found by preconditioned conjugate gradients on the Schur complement  A'WA - A'WJ M^-1 J'WA + lambda, over the voxels
+that are free to move (`free`: not held at zero by the bound).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 import scipy.linalg
 
 from tomopose.engines.cpu import CpuEngine
+from tomopose.refinement.joint_fit.precondition import Preconditioner
 from tomopose.units import Array, Floats
 
 
@@ -28,6 +29,8 @@ class Linear:
     engine:   projector of the current matrices.  free: bool, as the engine's state; voxels that may move.
     J:        (n, d, N) derivatives of each view's N pixels.  w: (n, N) weights.
     factor:   Cholesky factor of M (n d, n d).  ridge: lambda.
+    H:        what of each frequency the views see, or None: plain conjugate gradients.  Without a ridge a few plain
+              turns are the regularisation, so that a first volume is made with them.
     """
 
     engine: CpuEngine
@@ -36,15 +39,25 @@ class Linear:
     w: Floats
     factor: tuple[Array, bool]
     ridge: float
+    H: Floats | None = None
 
     @classmethod
-    def of(cls, engine: CpuEngine, free: np.ndarray, J: Floats, w: Floats, precision: Array, ridge: float) -> Linear:
+    def of(
+        cls,
+        engine: CpuEngine,
+        free: np.ndarray,
+        J: Floats,
+        w: Floats,
+        precision: Array,
+        ridge: float,
+        H: Floats | None = None,
+    ) -> Linear:
         """Factorise M = J'WJ + precision (n d, n d)."""
         d = J.shape[1]
         M = precision.copy()
         for j, block in enumerate(normal_blocks(J, w)):
             M[j * d : j * d + d, j * d : j * d + d] += block
-        return cls(engine=engine, free=free, J=J, w=w, factor=scipy.linalg.cho_factor(M), ridge=ridge)
+        return cls(engine=engine, free=free, J=J, w=w, factor=scipy.linalg.cho_factor(M), ridge=ridge, H=H)
 
     def project(self, x: np.ndarray) -> Floats:
         """A x, (n, N)."""
@@ -67,6 +80,16 @@ class Linear:
         """J q, (n, N), float32."""
         return np.asarray(np.einsum("ndp,nd->np", self.J, q.astype(np.float32)))
 
+    def preconditioner(self) -> Preconditioner | None:
+        """Scaled by what one random volume over the free voxels shows."""
+        if self.H is None:
+            return None
+        probe = np.random.default_rng(0).standard_normal(self.free.shape, dtype=np.float32)
+        probe = np.where(self.free, probe, np.float32(0))
+        lines = self.project(probe)
+        energy = float(np.einsum("np,np,np->", self.w, lines, lines, dtype=np.float64))
+        return Preconditioner.of(self.H, self.free, probe, energy, self.ridge)
+
     def solve(
         self, r: Floats, pull: Array, x: np.ndarray, *, turns: int, tolerance: float = 1e-3
     ) -> tuple[np.ndarray, Array]:
@@ -79,8 +102,10 @@ class Linear:
         ridge = np.float32(self.ridge)
         start = self.w * (r - self.moved(self.poses(r, pull)))
         residual = self.back(start) - ridge * np.where(self.free, x, 0)
-        dx, direction = np.zeros_like(residual), residual.copy()
-        size = first = float(np.vdot(residual, residual))
+        even = self.preconditioner()
+        eased = residual if even is None else even(residual)
+        dx, direction = np.zeros_like(residual), eased.copy()
+        size = first = float(np.vdot(residual, eased))
         for _ in range(turns):
             if size <= tolerance**2 * first or size == 0:
                 break
@@ -91,8 +116,9 @@ class Linear:
             alpha = np.float32(size / curvature)
             dx += alpha * direction
             residual -= alpha * response
-            new = float(np.vdot(residual, residual))
-            direction = residual + np.float32(new / size) * direction
+            eased = residual if even is None else even(residual)
+            new = float(np.vdot(residual, eased))
+            direction = eased + np.float32(new / size) * direction
             size = new
         return dx, self.poses(r - self.project(dx), pull)
 

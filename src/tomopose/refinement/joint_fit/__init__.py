@@ -1,0 +1,1 @@
+"""Volume and poses of one level, fitted together."""
