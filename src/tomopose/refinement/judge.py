@@ -10,7 +10,7 @@ import numpy as np
 from tomopose.engines.cpu import CpuEngine
 from tomopose.refinement.joint_fit.fit import Fit, State, blank, lines_of, matrices_of, residual_of
 from tomopose.refinement.joint_fit.measured import Measured
-from tomopose.refinement.settings import MISFIT, MISFIT_SHARE, SIGNIFICANCE
+from tomopose.refinement.settings import MISFIT, MISFIT_SHARE, OWN_SIGMA, SIGNIFICANCE
 from tomopose.units import Array, Floats
 
 
@@ -85,12 +85,13 @@ def residual(data: Measured, state: State, *, threads: int) -> Floats:
 
 
 def decide(
-    held_out: Trial, *, chi: float, cut: tuple[str, ...], left: float, open_: tuple[str, ...]
+    held_out: Trial, *, chi: float, cut: tuple[str, ...], left: float, open_: tuple[str, ...], moved: float
 ) -> tuple[Verdict, tuple[str, ...]]:
     """The verdict and its reasons, as sentences.
 
     chi: rms residual over noise of the fit; cut: faces of the grid that the object crosses; left: share of the rays
-    that do not meet what lies beyond them; open_: directions that the images do not determine.
+    that do not meet what lies beyond them; open_: directions that the images do not determine; moved: rms correction
+    over its rms standard uncertainty, both px.
     """
     reasons: list[str] = []
     misfit = float(np.median(held_out.residual_after))
@@ -111,4 +112,9 @@ def decide(
         return Verdict.UNDETERMINED, (*reasons, *open_)
     if held_out.gain < SIGNIFICANCE:
         return Verdict.UNCHANGED, (f"Nothing is gained by a correction: {gain}",)
+    if moved < OWN_SIGMA:
+        return Verdict.UNCHANGED, (
+            f"The correction is {moved:.1f} times its own standard uncertainty, {OWN_SIGMA:g} are needed: it would add "
+            "as much error as it removes",
+        )
     return Verdict.REFINED, (f"Pixels kept out of the fit agree: they gain {held_out.gain:.1f} standard errors",)

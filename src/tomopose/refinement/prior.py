@@ -21,6 +21,9 @@ from tomopose.units import Array
 LEAST = 5e-3
 """Smallest size of a part, relative to where it began: of 1 px it leaves less than the images' own uncertainty, and the
 covariance of slow parts keeps an inverse."""
+JUMP = 3.0
+"""Rms of a view's six coordinates, in standard deviations of the prior, from which it is one of its own: of a right
+prior one view in 10^9 is beyond."""
 LARGEST = 10.0
 """Largest: what was stated is not exceeded tenfold by evidence alone."""
 
@@ -56,8 +59,24 @@ class Prior:
         """The prior at the sizes that were stated."""
         return replace(self, sizes=np.ones(len(self.sizes)))
 
-    def by_evidence(self, q: Array, information: Array, *, turns: int = 20) -> Prior:
-        """The sizes that explain motions q (n, 6) best, given the images' information N (6n, 6n) about them."""
+    def of_views(self, rows: Array) -> Prior:
+        """The prior of some views alone."""
+        at = (6 * np.asarray(rows)[:, None] + np.arange(6)).ravel()
+        return replace(self, parts=tuple(K[np.ix_(at, at)] for K in self.parts))
+
+    def with_jumps(self, q: Array) -> Prior:
+        """Views whose motion (n, 6) is beyond `JUMP` standard deviations get a prior as wide as it."""
+        blocks = self.blocks
+        z = np.sqrt(np.einsum("nc,ncd,nd->n", q, np.linalg.inv(blocks), q) / q.shape[1])
+        wider = np.repeat(np.where(z > JUMP, z, 1.0), q.shape[1])
+        return replace(self, parts=tuple(wider[:, None] * K * wider for K in self.parts))
+
+    def by_evidence(self, q: Array, information: Array, *, most: float = np.inf, turns: int = 20) -> Prior:
+        """The sizes that explain motions q (n, 6) best, given the images' information N (6n, 6n) about them.
+
+        most: factor by which a size may change.  Once sizes are small, C^-1 q magnifies what the fit has not yet
+        reached, so that a later look corrects the first one but does not replace it.
+        """
         prior, flat = self, q.ravel()
         right = information @ flat + self.precision @ flat  # the estimate is where N q_data = this
         for _ in range(turns):
@@ -73,7 +92,7 @@ class Prior:
                 expected = float(np.einsum("ij,ji->", spread, K))
                 ratio = explained / expected if expected > 0 else 1.0
                 sizes.append(s * np.clip(ratio, 0.1, 10.0) ** 0.5)
-            new = np.clip(sizes, LEAST, LARGEST)
+            new = np.clip(np.clip(sizes, self.sizes / most, self.sizes * most), LEAST, LARGEST)
             done = np.all(np.abs(np.log(new / prior.sizes)) < 0.01)
             prior = replace(prior, sizes=new)
             if done:

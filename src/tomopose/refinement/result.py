@@ -38,6 +38,8 @@ class Refinement(Tabular):
     outliers:     indices of views whose correction stands out from the others (a jump).
     held_out_gain: mean gain over those pixels, in its own standard errors; chi: rms residual over noise of the fit.
     widening:     how much larger the uncertainty is than with the volume known.
+    halves_px, stated_px: rms difference, px per coordinate, of views refined in two disjoint sets, and the rms of the
+                  stated uncertainty of all views together beside it (a half has fewer views and is less exact).
     volume_before, volume: volumes under both geometries, at the resolution of the comparison.
     """
 
@@ -58,6 +60,8 @@ class Refinement(Tabular):
     prior_sizes: Mapping[str, float]
     outliers: tuple[int, ...] = ()
     widening: float = 1.0
+    halves_px: float = float("nan")
+    stated_px: float = float("nan")
     volume_before: Volume | None = None
     volume: Volume | None = None
     provenance: Provenance | None = None
@@ -128,6 +132,8 @@ def document(r: Refinement) -> dict[str, object]:
         "held_out_gain": r.held_out_gain,
         "prior_sizes": dict(r.prior_sizes),
         "sigma_over_volume_known": r.widening,
+        "halves_px": r.halves_px if np.isfinite(r.halves_px) else None,
+        "stated_px": r.stated_px if np.isfinite(r.stated_px) else None,
         "jumps": [r.pose_id[j] for j in r.outliers],
         "views": views,
         "provenance": None if r.provenance is None else r.provenance.to_json(),

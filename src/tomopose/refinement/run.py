@@ -17,6 +17,7 @@ from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.provenance import provenance
 from tomopose.reconstruction.line_integrals import Correction, ImagesAre, require_contrast
 from tomopose.reconstruction.run import line_integrals_of
+from tomopose.refinement.halves import difference_of_halves
 from tomopose.refinement.joint_fit.fit import Fit, State, blank, linearised
 from tomopose.refinement.joint_fit.linear import normal_blocks
 from tomopose.refinement.joint_fit.measured import Measured, crossed_faces, measured, rays_through
@@ -30,8 +31,8 @@ from tomopose.refinement.uncertainty import (
     VOLUME_UNKNOWN,
     drawn_errors,
     open_directions,
-    points_jacobian,
     spread_of,
+    widening_of,
 )
 from tomopose.units import Array
 from tomopose.values import Images, require_types
@@ -39,6 +40,8 @@ from tomopose.volume import Volume, VoxelGrid
 
 FEWEST_VIEWS = 8
 """Views below which the volume explains any motion of them."""
+LATER_LOOK = 2.0
+"""Factor by which a look at the evidence after the first one may change the prior's sizes."""
 GAUGE = (
     "A rigid motion of the whole object, common to all views, is not observable: the object keeps its mean pose.",
     "The size of the object (a depth common to all views) is not observable in its images: scale comes from the "
@@ -92,7 +95,7 @@ def refine(
     threads = s.threads or processors()
     prior, stated = prior_of(matrices, grid, s, calibration)
     factors = levels_of(data, s)
-    steps = Steps(2 * len(factors) + 3, progress)
+    steps = Steps(2 * len(factors) + 4, progress)
     found = estimate(data, factors, prior, s, threads, steps)
     result = assessed(found, matrices, s, threads, steps)
     steps.finish()
@@ -105,7 +108,7 @@ def assessed(
 ) -> Refinement:
     """What the estimate is worth: the judgement of the held-out pixels, the uncertainty, and what is not observable."""
     data, state, prior = found.data, found.state, found.prior
-    grid = data.grid
+    centre, radius = np.asarray(data.grid.centre), radius_of(data.grid)
     level = level_of(data, found.judged)
     fit = Fit(precision=prior.precision, steps=3, turns=s.turns, threads=threads)
     held_out, before, after = trial(level, state, fit)
@@ -113,16 +116,19 @@ def assessed(
     at = replace(after, q=state.q)
     here = linearised(level, at, threads=threads)
     information = normal_blocks(here.motions, here.weighed(level))
-    radius = radius_of(grid)
     left = float((level.weight > 0).mean()) / (1 - s.held_out) if found.faces else 1.0
     open_ = () if found.faces else open_directions(information, prior, radius)
-    verdict, reasons = decide(held_out, chi=state.chi, cut=found.faces, left=left, open_=open_)
-    errors = drawn_errors(level, at, here, prior, samples=s.samples, turns=2 * s.turns, seed=s.seed)
-    K = points_jacobian(data, points_of(grid))
-    spread = spread_of(errors, information, prior, K, chi=state.chi)
+    K = pixel_jacobian(data.matrices.P, points_of(data.grid), centre)
+    errors = drawn_errors(level, at, here, prior, samples=s.samples, turns=s.turns, seed=s.seed)
+    widening = widening_of(errors, information, prior, K)
+    spread = spread_of(widening, information if state.information is None else state.information, prior, K)
+    steps.done()
+    moved = np.sqrt(np.mean(np.einsum("nmic,nc->nmi", K, state.q) ** 2) / np.mean(spread.points_sigma**2))
+    halves = difference_of_halves(level, prior, replace(fit, steps=s.steps), points_of(data.grid))
+    verdict, reasons = decide(held_out, chi=state.chi, cut=found.faces, left=left, open_=open_, moved=float(moved))
     refined = replace(
         matrices,
-        P=matrices.P @ transforms(state.q, np.asarray(grid.centre)),
+        P=matrices.P @ transforms(state.q, centre),
         points_sigma=spread.points_sigma,
         points_sigma_shared=None,
     )
@@ -143,7 +149,9 @@ def assessed(
         chi=state.chi,
         prior_sizes={name: float(size) for name, size in zip(prior.names, prior.sizes, strict=True)},
         outliers=jumps(state.q, spread.sigma, radius),
-        widening=spread.widening,
+        widening=widening.factor,
+        halves_px=halves,
+        stated_px=float(np.sqrt(np.mean(spread.points_sigma**2))),
         volume_before=Volume(values=before.volume, grid=level.grid),
         volume=Volume(values=after.volume, grid=level.grid),
     )
@@ -184,6 +192,7 @@ def estimate(
     state: State | None = None
     coarse: VoxelGrid | None = None
     faces: tuple[str, ...] = ()
+    looked = False
     for factor in factors:
         level = level_of(data, factor)
         if state is None or coarse is None:
@@ -199,11 +208,14 @@ def estimate(
             held = Fit(precision=None, steps=1, turns=s.turns, threads=threads)
             state = held(level, replace(state, volume=finer(state.volume, coarse, level.grid)))
         for _ in range(2):
-            fit = Fit(precision=prior.precision, steps=max(1, s.steps // 2), turns=s.turns, threads=threads)
+            steps_now = s.steps if not looked else max(1, s.steps // 2)
+            fit = Fit(precision=prior.precision, steps=steps_now, turns=s.turns, threads=threads)
             state = fit(level, state)
             if state.information is not None:
                 information = scipy.linalg.block_diag(*state.information) / VOLUME_UNKNOWN
-                prior = prior.by_evidence(state.q, information)
+                prior = prior.by_evidence(state.q, information, most=LATER_LOOK if looked else np.inf)
+                prior = prior.with_jumps(state.q)
+                looked = True
             steps.done()
         coarse = level.grid
     assert state is not None

@@ -13,6 +13,10 @@ DEFAULT_SIGMA_PX = 1.0
 SIGNIFICANCE = 3.0
 """Standard errors by which the blocks kept out of the fit must gain before a correction is taken."""
 
+OWN_SIGMA = 2.0
+"""Rms correction over its own standard uncertainty from which it is taken.  A correction q of uncertainty sigma
+replaces an error of mean square q^2 - sigma^2 by one of sigma^2: it gains from sqrt(2) on."""
+
 MISFIT = 2.0
 """Residual over noise beyond which the model does not hold, where the residual is also larger than `MISFIT_SHARE`.
 On the scans of benchmarks/refine honest cases end at 1.0 to 1.4 (binned by 2: 1.7), a cut object beyond 2."""

@@ -29,12 +29,10 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True, kw_only=True)
 class Spread:
-    """sigma: (n, 6), mm and rad, of each view's motion; points_sigma: (n, m), px per coordinate; widening: ratio of the
-    draws' standard deviation to that with the volume known."""
+    """sigma: (n, 6), mm and rad, of each view's motion; points_sigma: (n, m), px per coordinate."""
 
     sigma: Array
     points_sigma: Array
-    widening: float
 
 
 def drawn_errors(
@@ -45,7 +43,7 @@ def drawn_errors(
     C, own = prior.covariance, prior.precision
     precision = with_levels(own)
     H = passed_frequencies(data.matrices, data.grid)
-    linear = Linear.of(here.engine, x > 0, here.J, w, precision, ridge_of(state.volume), H)
+    linear = Linear.of(here.engine, x > 0, here.J, w, precision, ridge_of(state.volume, state.chi), H)
     rng, root = np.random.default_rng([seed, 21]), np.linalg.cholesky(C + 1e-15 * np.trace(C) * np.eye(len(C)))
     G = gauge(data.matrices.P, np.asarray(data.grid.centre))
     sigma = np.where(w > 0, 1 / np.sqrt(np.maximum(w, 1e-30)), 0)
@@ -60,27 +58,46 @@ def drawn_errors(
     return errors
 
 
-def spread_of(errors: Array, information: Array, prior: Prior, K: Array, *, chi: float) -> Spread:
-    """Per view and point, from draws (s, n, 6), each view's information (n, 6, 6) and K (n, m, 2, 6), px per motion.
+@dataclass(frozen=True, kw_only=True)
+class Widening:
+    """How much an unknown volume widens the variance: points (m, 2), of points along u and v; motions: of all six."""
 
-    chi: rms residual over noise of the fit.  Above 1 the voxels do not explain the images to their noise, and all is as
-    much larger (Birge ratio), up to the prior.
-    """
-    n = len(information)
-    blocks = prior.blocks
-    known = np.linalg.inv(information + np.linalg.inv(blocks))
+    points: Array
+    motions: float
+
+    @property
+    def factor(self) -> float:
+        """Of the standard deviation, all points together."""
+        return float(np.sqrt(self.points.mean()))
+
+
+def widening_of(errors: Array, information: Array, prior: Prior, K: Array) -> Widening:
+    """From draws (s, n, 6), each view's information (n, 6, 6) of the same level, and K (n, m, 2, 6), px per motion."""
+    known = np.linalg.inv(information + np.linalg.inv(prior.blocks))
     drawn = np.einsum("nmic,snc->snmi", K, errors)
     with_volume_known = np.einsum("nmic,ncd,nmid->nmi", K, known, K)
-    ratio = np.maximum((drawn**2).mean(axis=(0, 1)) / with_volume_known.mean(axis=0), 1.0)  # (m, 2)
-    excess = max(chi, 1.0) ** 2
-    variance = with_volume_known * ratio * excess
-    of_motion = np.maximum((errors**2).mean(axis=(0, 1)) / np.einsum("ncc->c", known) * n, 1.0)
+    root = np.sqrt(np.einsum("ncc->nc", prior.blocks).mean(axis=0))
+    motions = ((errors / root) ** 2).mean() / np.mean(np.einsum("ncc->nc", known) / root**2)
+    return Widening(
+        points=np.maximum((drawn**2).mean(axis=(0, 1)) / with_volume_known.mean(axis=0), 1.0),
+        motions=max(float(motions), 1.0),
+    )
+
+
+def spread_of(widening: Widening, information: Array, prior: Prior, K: Array) -> Spread:
+    """Per view and point, from each view's information (n, 6, 6) of the finest level; never more than the prior.
+
+    The information holds the size of the residual already: where the voxels do not explain the images to their noise,
+    the weights are as much smaller (Birge ratio).
+    """
+    blocks = prior.blocks
+    known = np.linalg.inv(information + np.linalg.inv(blocks))
+    with_volume_known = np.einsum("nmic,ncd,nmid->nmi", K, known, K)
     prior_points = np.einsum("nmic,ncd,nmid->nmi", K, blocks, K)
-    variance = np.minimum(variance, np.maximum(prior_points, with_volume_known))
+    variance = np.minimum(with_volume_known * widening.points, np.maximum(prior_points, with_volume_known))
     return Spread(
-        sigma=np.sqrt(np.minimum(np.einsum("ncc->nc", known) * of_motion * excess, np.einsum("ncc->nc", blocks))),
+        sigma=np.sqrt(np.minimum(np.einsum("ncc->nc", known) * widening.motions, np.einsum("ncc->nc", blocks))),
         points_sigma=np.sqrt(variance.mean(axis=2)),
-        widening=float(np.sqrt(ratio.mean())),
     )
 
 

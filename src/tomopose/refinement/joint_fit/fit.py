@@ -22,7 +22,7 @@ ROBUST = 4.0
 """Residuals beyond this many rms are pulled back to it (Huber): scatter and dead pixels, one in 16,000 of noise."""
 SHORTEST_STEP = 0.05
 """Part of a step at which the line search ends."""
-SETTLED = 3e-4
+SETTLED = 2e-3
 """Relative gain of the joint cost below which a level has reached its minimum."""
 
 Tell = Callable[[str], None]
@@ -98,9 +98,10 @@ def linearised(data: Measured, state: State, *, threads: int, held: bool = False
     return Linearised(engine=engine, x=x, J=J, r=residual_of(data, lines, state.offset))
 
 
-def ridge_of(volume: np.ndarray) -> float:
-    """lambda: the inverse mean square of the material's voxels."""
-    return 1.0 / max(float(np.mean(volume[volume > 0] ** 2)), 1e-30)
+def ridge_of(volume: np.ndarray, chi: float) -> float:
+    """lambda: the inverse mean square of the material's voxels, as much smaller as the weights are (chi: the residual
+    over the noise): a volume that does not fit yet must not be drawn to zero for it."""
+    return 1.0 / max(float(np.mean(volume[volume > 0] ** 2)), 1e-30) / max(chi, 1.0) ** 2
 
 
 def with_levels(precision: Array) -> Array:
@@ -154,7 +155,7 @@ class Fit:
         precision = self._precision(n, held=held)
         unknown = np.concatenate([state.q, state.offset[:, None]], axis=1)[:, 6 if held else 0 :]
         free = self._free(engine, x, w * r, first=first)
-        ridge = 0.0 if first else ridge_of(state.volume)
+        ridge = 0.0 if first else ridge_of(state.volume, chi)
         linear = Linear.of(engine, free, here.J, w, precision, ridge, H)
         pull = precision @ unknown.ravel()
         dx, dq = linear.solve(r, pull, x, turns=2 * self.turns if first else self.turns)
