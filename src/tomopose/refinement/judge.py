@@ -84,37 +84,56 @@ def residual(data: Measured, state: State, *, threads: int) -> Floats:
     return residual_of(data, lines, state.offset)
 
 
-def decide(
-    held_out: Trial, *, chi: float, cut: tuple[str, ...], left: float, open_: tuple[str, ...], moved: float
-) -> tuple[Verdict, tuple[str, ...]]:
-    """The verdict and its reasons, as sentences.
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """What the verdict is made from.
 
-    chi: rms residual over noise of the fit; cut: faces of the grid that the object crosses; left: share of the rays
-    that do not meet what lies beyond them; open_: directions that the images do not determine; moved: rms correction
-    over its rms standard uncertainty, both px.
+    held_out: the pixels that took no part.  chi: rms residual over noise of the fit.  faces: of the grid that the
+    object crosses; left: share of the rays that do not meet what lies beyond them.  edges: of the images that the
+    object crosses.  open_: directions that the images do not determine, as sentences.  moved: rms correction over its
+    rms standard uncertainty.
     """
+
+    held_out: Trial
+    chi: float
+    faces: tuple[str, ...]
+    left: float
+    edges: tuple[str, ...]
+    open_: tuple[str, ...]
+    moved: float
+
+
+def decide(e: Evidence) -> tuple[Verdict, tuple[str, ...]]:
+    """The verdict and its reasons, as sentences."""
     reasons: list[str] = []
-    misfit = float(np.median(held_out.residual_after))
-    if cut:
+    misfit = float(np.median(e.held_out.residual_after))
+    if e.faces:
         reasons.append(
-            f"The object reaches beyond the grid ({', '.join(cut)}); {100 * left:.0f} % of the rays do not meet what "
-            "lies there. Use a grid that holds the whole object"
+            f"The object reaches beyond the grid ({', '.join(e.faces)}); {100 * e.left:.0f} % of the rays do not meet "
+            "what lies there. Use a grid that holds the whole object"
         )
-    if chi > MISFIT and misfit > MISFIT_SHARE:
+    if e.edges:
         reasons.append(
-            f"The residual is {chi:.1f} times the images' noise ({100 * misfit:.1f} % of the line integrals): the "
+            f"The object reaches beyond the images ({', '.join(e.edges)}): what lies there changes from view to view "
+            "and looks like motion. Use a scan that shows the whole object"
+        )
+    if e.chi > MISFIT and misfit > MISFIT_SHARE:
+        reasons.append(
+            f"The residual is {e.chi:.1f} times the images' noise ({100 * misfit:.1f} % of the line integrals): the "
             "volume does not explain the images (object cut by the view or the grid, scatter, or wrong matrices)"
         )
-    gain = f"held-out pixels gain {held_out.gain:.1f} standard errors, {SIGNIFICANCE:g} are needed"
-    if cut:
+    reasons += e.open_
+    if reasons:
         return Verdict.UNDETERMINED, tuple(reasons)
-    if reasons or open_:
-        return Verdict.UNDETERMINED, (*reasons, *open_)
-    if held_out.gain < SIGNIFICANCE:
+    gain = f"held-out pixels gain {e.held_out.gain:.1f} standard errors, {SIGNIFICANCE:g} are needed"
+    if e.held_out.gain < SIGNIFICANCE:
         return Verdict.UNCHANGED, (f"Nothing is gained by a correction: {gain}",)
-    if moved < OWN_SIGMA:
+    if e.moved < OWN_SIGMA:
         return Verdict.UNCHANGED, (
-            f"The correction is {moved:.1f} times its own standard uncertainty, {OWN_SIGMA:g} are needed: it would add "
-            "as much error as it removes",
+            f"The correction is {e.moved:.1f} times its own standard uncertainty, {OWN_SIGMA:g} are needed: it would "
+            "add as much error as it removes",
         )
-    return Verdict.REFINED, (f"Pixels kept out of the fit agree: they gain {held_out.gain:.1f} standard errors",)
+    return Verdict.REFINED, (
+        f"Pixels kept out of the fit agree: they gain {e.held_out.gain:.1f} standard errors",
+        f"The correction is {e.moved:.1f} times its own standard uncertainty",
+    )

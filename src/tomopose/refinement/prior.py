@@ -59,6 +59,10 @@ class Prior:
         """The prior at the sizes that were stated."""
         return replace(self, sizes=np.ones(len(self.sizes)))
 
+    def size_px(self, K: Array) -> float:
+        """Rms standard uncertainty, px per coordinate, where K (n, m, 2, 6) is px per motion."""
+        return float(np.sqrt(np.mean(np.einsum("nmic,ncd,nmid->nmi", K, self.blocks, K))))
+
     def of_views(self, rows: Array) -> Prior:
         """The prior of some views alone."""
         at = (6 * np.asarray(rows)[:, None] + np.arange(6)).ravel()

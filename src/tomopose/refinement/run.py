@@ -20,10 +20,10 @@ from tomopose.reconstruction.run import line_integrals_of
 from tomopose.refinement.halves import difference_of_halves
 from tomopose.refinement.joint_fit.fit import Fit, State, blank, linearised
 from tomopose.refinement.joint_fit.linear import normal_blocks
-from tomopose.refinement.joint_fit.measured import Measured, crossed_faces, measured, rays_through
+from tomopose.refinement.joint_fit.measured import Measured, crossed_edges, crossed_faces, measured, rays_through
 from tomopose.refinement.joint_fit.motions import pixel_jacobian, transforms
 from tomopose.refinement.joint_fit.pyramid import finer, level_of
-from tomopose.refinement.judge import Verdict, decide, trial
+from tomopose.refinement.judge import Evidence, Verdict, decide, trial
 from tomopose.refinement.prior import Prior, scatter
 from tomopose.refinement.result import Refinement
 from tomopose.refinement.settings import DEFAULT_SIGMA_PX, LEAST_PIXELS, MOST_SAMPLES, RefineSettings
@@ -40,6 +40,9 @@ from tomopose.volume import Volume, VoxelGrid
 
 FEWEST_VIEWS = 8
 """Views below which the volume explains any motion of them."""
+NOTHING_LEFT_PX = 0.02
+"""Rms errors of the views, px, by the evidence, below which finer levels are left out: what images of 100 px reach with
+the object known."""
 LATER_LOOK = 2.0
 """Factor by which a look at the evidence after the first one may change the prior's sizes."""
 GAUGE = (
@@ -125,7 +128,17 @@ def assessed(
     steps.done()
     moved = np.sqrt(np.mean(np.einsum("nmic,nc->nmi", K, state.q) ** 2) / np.mean(spread.points_sigma**2))
     halves = difference_of_halves(level, prior, replace(fit, steps=s.steps), points_of(data.grid))
-    verdict, reasons = decide(held_out, chi=state.chi, cut=found.faces, left=left, open_=open_, moved=float(moved))
+    verdict, reasons = decide(
+        Evidence(
+            held_out=held_out,
+            chi=state.chi,
+            faces=found.faces,
+            left=left,
+            edges=found.edges,
+            open_=open_,
+            moved=float(moved),
+        )
+    )
     refined = replace(
         matrices,
         P=matrices.P @ transforms(state.q, centre),
@@ -159,12 +172,14 @@ def assessed(
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """state, prior: with the sizes of the evidence; faces: that the object crosses; data: without the rays that meet
-    what lies beyond them; judged: the binning at which the held-out pixels are compared."""
+    """state, prior: with the sizes of the evidence; faces, edges: of the grid and of the images that the object
+    crosses; data: without the rays that meet what lies beyond the faces; judged: the binning at which the held-out
+    pixels are compared."""
 
     state: State
     prior: Prior
     faces: tuple[str, ...]
+    edges: tuple[str, ...]
     data: Measured
     judged: int
 
@@ -192,7 +207,8 @@ def estimate(
     state: State | None = None
     coarse: VoxelGrid | None = None
     faces: tuple[str, ...] = ()
-    looked = False
+    edges = crossed_edges(data)
+    points, centre, looked = points_of(data.grid), np.asarray(data.grid.centre), False
     for factor in factors:
         level = level_of(data, factor)
         if state is None or coarse is None:
@@ -207,20 +223,21 @@ def estimate(
             # the volume first: poses would follow what a coarse one lacks
             held = Fit(precision=None, steps=1, turns=s.turns, threads=threads)
             state = held(level, replace(state, volume=finer(state.volume, coarse, level.grid)))
-        for _ in range(2):
-            steps_now = s.steps if not looked else max(1, s.steps // 2)
-            fit = Fit(precision=prior.precision, steps=steps_now, turns=s.turns, threads=threads)
-            state = fit(level, state)
+        for _ in range(1 if looked else 2):
+            first_look = Fit(precision=prior.precision, steps=s.steps, turns=s.turns, threads=threads)
+            later = replace(first_look, steps=max(1, s.steps // 2))
+            state = (later if looked else first_look)(level, state)
             if state.information is not None:
                 information = scipy.linalg.block_diag(*state.information) / VOLUME_UNKNOWN
                 prior = prior.by_evidence(state.q, information, most=LATER_LOOK if looked else np.inf)
                 prior = prior.with_jumps(state.q)
                 looked = True
             steps.done()
-        coarse = level.grid
+        coarse, judged = level.grid, max(factor, min(2, factors[0]))
+        if faces or edges or prior.size_px(pixel_jacobian(data.matrices.P, points, centre)) < NOTHING_LEFT_PX:
+            break  # finer levels would not change what is said
     assert state is not None
-    judged = max(factors[-1], min(2, factors[0]))
-    return Estimate(state=state, prior=prior, faces=faces, data=data, judged=judged)
+    return Estimate(state=state, prior=prior, faces=faces, edges=edges, data=data, judged=judged)
 
 
 def without_rays(data: Measured, faces: tuple[str, ...]) -> Measured:

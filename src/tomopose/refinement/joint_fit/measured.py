@@ -26,7 +26,8 @@ voxels leaves of an exact line integral's rounding."""
 MATTER = 0.15
 """Share of the volume's dense values (99.9 %) from which a voxel of the outermost layers counts as matter."""
 CROSSED = 0.05
-"""Share of a face's voxels that are matter from which the object crosses it: noise and streaks fill less."""
+"""Share of a face's voxels, or of an image edge's pixels and of the views, from which the object crosses it: noise and
+streaks fill less."""
 FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 
 
@@ -136,6 +137,22 @@ def crossed_faces(volume: np.ndarray) -> tuple[str, ...]:
             if float(np.mean(outer.mean(axis=0) > MATTER * dense)) > CROSSED:
                 faces.append(sign + name)
     return tuple(sorted(faces, key=FACES.index))
+
+
+def crossed_edges(data: Measured) -> tuple[str, ...]:
+    """Edges of the images at which the object leaves the view: matter there in more than a few views."""
+    m = data.matrices
+    images = data.p.reshape(len(data.p), m.n_u, m.n_v)
+    dense = float(np.quantile(images, 0.999))
+    if dense <= 0:
+        return ()
+    edges = {"-u": images[:, :2], "+u": images[:, -2:], "-v": images[:, :, :2], "+v": images[:, :, -2:]}
+    found = []
+    for name, pixels in edges.items():
+        matter = pixels.mean(axis=1 if name[1] == "u" else 2) > MATTER * dense
+        if float(np.mean(matter.mean(axis=1) > CROSSED)) > CROSSED:
+            found.append(name)
+    return tuple(found)
 
 
 def rays_through(data: Measured, faces: tuple[str, ...]) -> Array:
