@@ -196,14 +196,14 @@ def scan(
     return np.maximum(rng.poisson(T * count), 1) / count, P, P_true, panel
 
 
-def error_px(P: np.ndarray, P_true: np.ndarray, half: float = 8.0) -> float:
-    """rms px over corners of the object, the object's best rigid pose removed (Gauss-Newton, own code)."""
-    x = half * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+def pixels(P: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """(n, m, 2) of points x (m, 3)."""
+    h = np.einsum("nij,mj->nmi", P[:, :, :3], x) + P[:, None, :, 3]
+    return h[..., :2] / h[..., 2:]
 
-    def pixels(A: np.ndarray, y: np.ndarray) -> np.ndarray:
-        h = np.einsum("nij,mj->nmi", A[:, :, :3], y) + A[:, None, :, 3]
-        return h[..., :2] / h[..., 2:]
 
+def differences(P: np.ndarray, P_true: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """(n, m, 2) px of points x (m, 3), the object's best rigid pose removed (Gauss-Newton, own code)."""
     target, pose = pixels(P_true, x), np.zeros(6)
 
     def at(q: np.ndarray) -> np.ndarray:
@@ -213,4 +213,10 @@ def error_px(P: np.ndarray, P_true: np.ndarray, half: float = 8.0) -> float:
         r = at(pose)
         J = np.stack([(at(pose + 1e-5 * e) - r) / 1e-5 for e in np.eye(6)], 1)
         pose = pose - np.linalg.lstsq(J, r, rcond=None)[0]
-    return float(np.sqrt(2 * np.mean(at(pose) ** 2)))
+    return at(pose).reshape(target.shape)
+
+
+def error_px(P: np.ndarray, P_true: np.ndarray, half: float = 8.0) -> float:
+    """rms px over corners of the object, the object's best rigid pose removed."""
+    x = half * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    return float(np.sqrt(2 * np.mean(differences(P, P_true, x) ** 2)))

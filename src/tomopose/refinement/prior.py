@@ -21,6 +21,7 @@ from tomopose.units import Array
 LEAST = 5e-3
 """Smallest size of a part, relative to where it began: of 1 px it leaves less than the images' own uncertainty, and the
 covariance of slow parts keeps an inverse."""
+SHARED = "shared by all views, of the calibration"
 JUMP = 3.0
 """Rms of a view's six coordinates, in standard deviations of the prior, from which it is one of its own: of a right
 prior one view in 10^9 is beyond."""
@@ -102,6 +103,14 @@ class Prior:
             if done:
                 break
         return prior
+
+
+def with_shared_errors(prior: Prior, L: Array, C: Array) -> Prior:
+    """The prior with errors that all views share: L (n, 6, c) motions by each parameter, C (c, c) their covariance."""
+    flat = L.reshape(-1, L.shape[2])
+    return Prior(
+        names=(*prior.names, SHARED), parts=(*prior.parts, flat @ C @ flat.T), sizes=np.append(prior.sizes, 1.0)
+    )
 
 
 def scatter(sigma_mm: Array, sigma_rad: Array) -> Prior:

@@ -101,6 +101,20 @@ def spread_of(widening: Widening, information: Array, prior: Prior, K: Array) ->
     )
 
 
+def size_sigma(prior: Prior, P: Array, points: Array, centre: Array) -> Array:
+    """(n, m) px per coordinate: the uncertainty of points (m, 3) of W that the object's size has, which no image shows
+    and all views share; a rigid pose of the object is removed."""
+    G = gauge(P, centre)
+    flat = G.reshape(-1, 7)
+    scale = 1 / np.linalg.norm(flat, axis=0)
+    inner = (flat * scale).T @ prior.precision @ (flat * scale)
+    sigma = float(np.sqrt(np.linalg.pinv(inner, rcond=1e-12, hermitian=True)[6, 6])) * scale[6]
+    moved = (pixel_jacobian(P, points, centre) @ G[:, None]).reshape(-1, 7)
+    rigid = moved[:, :6] / np.linalg.norm(moved[:, :6], axis=0)
+    left = moved[:, 6] - rigid @ np.linalg.lstsq(rigid, moved[:, 6], rcond=1e-9)[0]
+    return np.asarray(sigma * np.sqrt(np.mean(left.reshape(len(P), len(points), 2) ** 2, axis=2)))
+
+
 def open_directions(information: Array, prior: Prior, radius: float) -> tuple[str, ...]:
     """Directions of the object's frame that no view determines, as sentences.
 
@@ -130,8 +144,3 @@ def direction_in_words(motion: Array, radius: float) -> str:
     k = int(np.abs(axis).argmax())
     where = AXES[k] if abs(axis[k]) > 0.95 else "(" + ", ".join(f"{a:.2f}" for a in axis * np.sign(axis[k])) + ")"
     return f"A turn of the object about {where}" if turning else f"Motion of the object along {where}"
-
-
-def points_jacobian(data: Measured, points: Array) -> Array:
-    """(n, m, 2, 6) px per mm and rad."""
-    return pixel_jacobian(data.matrices.P, points, np.asarray(data.grid.centre))
