@@ -173,8 +173,8 @@ def table(rows: list[dict[str, object]]) -> str:
         if "alternation" in r:
             errors = np.asarray(r["alternation"])
             lines.append(
-                f"| {r['name']}, binned by 2 | {r['before']:.3f} px | best {errors.min():.3f}, last {errors[-1]:.3f} px "
-                f"(joint fit: {r['joint']:.3f} px) | | | | | |"
+                f"| {r['name']}, binned by 2 | {r['before']:.3f} px | best {errors.min():.3f} px, last "
+                f"{errors[-1]:.3f} px; joint fit {r['joint']:.3f} px | | | | | |"
             )
             continue
         goal = f"{2 * float(r['bound']):.3f} px (2 x {float(r['bound']):.3f})" if "bound" in r else f"{r['goal']}"

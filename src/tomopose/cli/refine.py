@@ -35,6 +35,17 @@ class Options(ScanAndGrid, CorrectedImages, WritingOptions):
     calibration: Annotated[
         Path | None, typer.Option("--calibration", help="calibration.json that the matrices were made from.")
     ] = None
+    poses: Annotated[
+        Path | None,
+        typer.Option("--poses", help="The scan's poses.csv: with --calibration its whole covariance is the prior."),
+    ] = None
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option(
+            "--checkpoint",
+            help="Folder to keep the state in; a second run with the same images and settings continues from there.",
+        ),
+    ] = None
     sigma: Annotated[
         float | None,
         typer.Option("--sigma-px", help="Prior uncertainty of a view, px; default: what the matrices state, else 1."),
@@ -61,6 +72,7 @@ def refine(options: Options) -> int:
         require_absent(o.out / name, force=o.force)
     P = tp.read_matrices(o.matrices)
     calibration = None if o.calibration is None else tp.read_calibration(o.calibration)
+    poses = None if o.poses is None else tp.read_poses(o.poses)
     known: Any = None if o.scanner is None else tp.read_scanner(o.scanner)
     stack = open_for(
         say, image_source(o.images), known, None, dark=o.dark, flat=o.flat, dataset=o.dataset, rows=o.rows, raw=o.raw
@@ -68,8 +80,20 @@ def refine(options: Options) -> int:
     correction = correction_from(o, stack.rows)
     settings = tp.RefineSettings(sigma_px=o.sigma, seed=o.seed, threads=o.workers)
     with say.progress("refining") as progress:
-        result = tp.refine(stack, P, grid, calibration, correction=correction, settings=settings, progress=progress)
-    inputs = [path for path in (o.matrices, o.calibration, o.scanner, o.bad_pixels, o.scene) if path is not None]
+        result = tp.refine(
+            stack,
+            P,
+            grid,
+            calibration,
+            poses=poses,
+            correction=correction,
+            settings=settings,
+            checkpoint=o.checkpoint,
+            progress=progress,
+        )
+    inputs = [
+        path for path in (o.matrices, o.calibration, o.poses, o.scanner, o.bad_pixels, o.scene) if path is not None
+    ]
     asked = arguments(
         voxel_mm=o.voxel, size=o.size, centre_mm=o.centre, images_are=o.images_are, verdict=result.verdict,
         **(dict(result.provenance.arguments) if result.provenance else {}),
@@ -95,6 +119,8 @@ def write(o: Options, result: Refinement, made: Provenance) -> None:
         reasons=result.reasons,
         unobservable=result.unobservable,
         gain=result.held_out_gain,
+        halves_px=result.halves_px,
+        stated_px=result.stated_px,
         before=result.volume_before,
         after=result.volume,
         provenance=made,
@@ -121,6 +147,8 @@ def said(o: Options, result: Refinement) -> None:
             "converged": result.converged,
             "median_residual_before": float(np.median(result.residual_before)),
             "median_residual_after": float(np.median(result.residual_after)),
+            "halves_px": result.halves_px if np.isfinite(result.halves_px) else None,
+            "stated_px": result.stated_px,
             "points_sigma_px": None if sigma is None else float(np.sqrt(np.mean(sigma**2))),
             "jumps": [result.pose_id[j] for j in result.outliers],
         },
@@ -130,6 +158,8 @@ def said(o: Options, result: Refinement) -> None:
             f"  residual of a view, median: {np.median(result.residual_before):.3g} before, "
             f"{np.median(result.residual_after):.3g} after",
             *([] if sigma is None else [f"  standard uncertainty of a view: {np.sqrt(np.mean(sigma**2)):.3g} px"]),
+            f"  two halves of the views, refined apart, differ by {result.halves_px:.3g} px; stated for all views: "
+            f"{result.stated_px:.3g} px",
             *(f"  view {result.pose_id[j]} stands out from the others" for j in result.outliers),
             *(f"  note: {sentence}" for sentence in result.unobservable),
         ],

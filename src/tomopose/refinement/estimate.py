@@ -8,15 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 
+from tomopose.refinement.checkpoint import Checkpoint, Reached
 from tomopose.refinement.joint_fit.fit import Fit, State, blank
 from tomopose.refinement.joint_fit.measured import Measured, crossed_edges, crossed_faces, rays_through
 from tomopose.refinement.joint_fit.motions import pixel_jacobian
-from tomopose.refinement.joint_fit.pyramid import finer, level_of
+from tomopose.refinement.joint_fit.pyramid import binned, finer, level_of
 from tomopose.refinement.prior import Prior
 from tomopose.refinement.settings import LEAST_PIXELS, MOST_SAMPLES, RefineSettings
 from tomopose.refinement.stated import points_of
 from tomopose.refinement.uncertainty import VOLUME_UNKNOWN
-from tomopose.volume import VoxelGrid
+from tomopose.units import Array
 
 NOTHING_LEFT_PX = 0.02
 """Rms errors of the views, px, by the evidence, below which finer levels are left out: what images of 100 px reach with
@@ -57,47 +58,83 @@ class Steps:
 
 
 def estimate(
-    data: Measured, factors: tuple[int, ...], prior: Prior, s: RefineSettings, threads: int, steps: Steps
+    data: Measured,
+    factors: tuple[int, ...],
+    prior: Prior,
+    s: RefineSettings,
+    threads: int,
+    steps: Steps,
+    checkpoint: Checkpoint | None = None,
 ) -> Estimate:
-    """Volume and poses, coarse to fine."""
-    state: State | None = None
-    coarse: VoxelGrid | None = None
-    faces: tuple[str, ...] = ()
+    """Volume and poses, coarse to fine; what a level reached is kept in the checkpoint, and continued from there."""
     edges = crossed_edges(data)
-    points, centre, looked = points_of(data.grid), np.asarray(data.grid.centre), False
-    for factor in factors:
-        level = level_of(data, factor)
-        if state is None or coarse is None:
-            held = Fit(precision=None, steps=1, turns=s.turns, threads=threads)
-            state = held(level, blank(level))
-            faces = crossed_faces(state.volume)
-            if faces:
-                data = without_rays(data, faces)
-                level = without_rays(level, faces)
-                state = blank(level)
-        else:
-            # the volume first: poses would follow what a coarse one lacks
-            held = Fit(precision=None, steps=1, turns=s.turns, threads=threads)
-            state = held(level, replace(state, volume=finer(state.volume, coarse, level.grid)))
-        for _ in range(1 if looked else 2):
-            first_look = Fit(precision=prior.precision, steps=s.steps, turns=s.turns, threads=threads)
-            later = replace(first_look, steps=max(1, s.steps // 2))
-            state = (later if looked else first_look)(level, state)
-            if state.information is not None:
-                information = scipy.linalg.block_diag(*state.information) / VOLUME_UNKNOWN
-                prior = prior.by_evidence(state.q, information, most=LATER_LOOK if looked else np.inf)
-                prior = prior.with_jumps(state.q)
-                looked = True
-            steps.done()
-        coarse, judged = level.grid, max(factor, min(2, factors[0]))
-        if faces or edges or prior.size_px(pixel_jacobian(data.matrices.P, points, centre)) < NOTHING_LEFT_PX:
-            break  # finer levels would not change what is said
-    assert state is not None
-    return Estimate(state=state, prior=prior, faces=faces, edges=edges, data=data, judged=judged)
+    K = pixel_jacobian(data.matrices.P, points_of(data.grid), np.asarray(data.grid.centre))
+    reached = None if checkpoint is None else checkpoint.resume(prior)
+    while reached is None or not (reached.levels == len(factors) or said_already(reached, edges, K)):
+        reached = next_level(data, factors, prior, s, threads, steps, reached)
+        if checkpoint is not None:
+            checkpoint.keep(reached)
+    return Estimate(
+        state=reached.state,
+        prior=reached.prior,
+        faces=reached.faces,
+        edges=edges,
+        data=without_rays(data, reached.faces),
+        judged=max(factors[reached.levels - 1], min(2, factors[0])),
+    )
+
+
+def said_already(reached: Reached, edges: tuple[str, ...], K: Array) -> bool:
+    """Whether finer levels would not change what is said: the object is cut, or hardly any errors are left."""
+    return bool(reached.faces or edges) or reached.prior.size_px(K) < NOTHING_LEFT_PX
+
+
+def next_level(
+    data: Measured,
+    factors: tuple[int, ...],
+    prior: Prior,
+    s: RefineSettings,
+    threads: int,
+    steps: Steps,
+    reached: Reached | None,
+) -> Reached:
+    """The first level, from nothing, or the one after what was reached."""
+    held = Fit(precision=None, steps=1, turns=s.turns, threads=threads)
+    if reached is None:
+        level = level_of(data, factors[0])
+        state = held(level, blank(level))
+        faces = crossed_faces(state.volume)
+        if faces:
+            level = without_rays(level, faces)
+            state = blank(level)
+        state = Fit(precision=prior.precision, steps=s.steps, turns=s.turns, threads=threads)(level, state)
+        prior = by_evidence(prior, state, most=np.inf)
+        steps.done()
+    else:
+        prior, faces = reached.prior, reached.faces
+        level = without_rays(level_of(data, factors[reached.levels]), faces)
+        coarse = binned(data, factors[reached.levels - 1]).grid
+        # the volume first: poses would follow what a coarse one lacks
+        state = held(level, replace(reached.state, volume=finer(reached.state.volume, coarse, level.grid)))
+    later = max(1, s.steps // 2)
+    state = Fit(precision=prior.precision, steps=later, turns=s.turns, threads=threads)(level, state)
+    steps.done()
+    levels = 1 if reached is None else reached.levels + 1
+    return Reached(levels=levels, state=state, prior=by_evidence(prior, state, most=LATER_LOOK), faces=faces)
+
+
+def by_evidence(prior: Prior, state: State, *, most: float) -> Prior:
+    """The prior with the sizes that the state's motions show, and wider where a view jumps."""
+    if state.information is None:
+        return prior
+    information = scipy.linalg.block_diag(*state.information) / VOLUME_UNKNOWN
+    return prior.by_evidence(state.q, information, most=most).with_jumps(state.q)
 
 
 def without_rays(data: Measured, faces: tuple[str, ...]) -> Measured:
     """The data with the rays left out that cross one of the grid's faces."""
+    if not faces:
+        return data
     through = rays_through(data, faces)
     zero = np.float32(0)
     return replace(data, weight=np.where(through, zero, data.weight), judge=np.where(through, zero, data.judge))

@@ -31,17 +31,19 @@ LARGEST = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class Prior:
-    """parts: name -> pattern K_i (6n, 6n), at the size that was stated; sizes: s_i, relative to it."""
+    """parts: name -> pattern K_i (6n, 6n), at the size that was stated; sizes: s_i, relative to it; widths: (6n,)
+    factors on the standard deviations, above 1 for views that jump."""
 
     names: tuple[str, ...]
     parts: tuple[Array, ...]
     sizes: Array
+    widths: Array
 
     @property
     def covariance(self) -> Array:
         """C (6n, 6n)."""
         C: Array = sum((s**2 * K for s, K in zip(self.sizes, self.parts, strict=True)), np.zeros_like(self.parts[0]))
-        return C
+        return np.asarray(self.widths[:, None] * C * self.widths)
 
     @property
     def precision(self) -> Array:
@@ -58,7 +60,7 @@ class Prior:
     @property
     def stated(self) -> Prior:
         """The prior at the sizes that were stated."""
-        return replace(self, sizes=np.ones(len(self.sizes)))
+        return replace(self, sizes=np.ones(len(self.sizes)), widths=np.ones(len(self.widths)))
 
     def size_px(self, K: Array) -> float:
         """Rms standard uncertainty, px per coordinate, where K (n, m, 2, 6) is px per motion."""
@@ -67,14 +69,13 @@ class Prior:
     def of_views(self, rows: Array) -> Prior:
         """The prior of some views alone."""
         at = (6 * np.asarray(rows)[:, None] + np.arange(6)).ravel()
-        return replace(self, parts=tuple(K[np.ix_(at, at)] for K in self.parts))
+        return replace(self, parts=tuple(K[np.ix_(at, at)] for K in self.parts), widths=self.widths[at])
 
     def with_jumps(self, q: Array) -> Prior:
         """Views whose motion (n, 6) is beyond `JUMP` standard deviations get a prior as wide as it."""
         blocks = self.blocks
         z = np.sqrt(np.einsum("nc,ncd,nd->n", q, np.linalg.inv(blocks), q) / q.shape[1])
-        wider = np.repeat(np.where(z > JUMP, z, 1.0), q.shape[1])
-        return replace(self, parts=tuple(wider[:, None] * K * wider for K in self.parts))
+        return replace(self, widths=self.widths * np.repeat(np.where(z > JUMP, z, 1.0), q.shape[1]))
 
     def by_evidence(self, q: Array, information: Array, *, most: float = np.inf, turns: int = 20) -> Prior:
         """The sizes that explain motions q (n, 6) best, given the images' information N (6n, 6n) about them.
@@ -92,6 +93,7 @@ class Prior:
             pull = precision @ mean
             spread = precision - precision @ posterior @ precision
             sizes = []
+            pull, spread = pull * self.widths, self.widths[:, None] * spread * self.widths
             for s, K in zip(prior.sizes, prior.parts, strict=True):
                 explained = float(pull @ K @ pull)
                 expected = float(np.einsum("ij,ji->", spread, K))
@@ -108,8 +110,11 @@ class Prior:
 def with_shared_errors(prior: Prior, L: Array, C: Array) -> Prior:
     """The prior with errors that all views share: L (n, 6, c) motions by each parameter, C (c, c) their covariance."""
     flat = L.reshape(-1, L.shape[2])
-    return Prior(
-        names=(*prior.names, SHARED), parts=(*prior.parts, flat @ C @ flat.T), sizes=np.append(prior.sizes, 1.0)
+    return replace(
+        prior,
+        names=(*prior.names, SHARED),
+        parts=(*prior.parts, flat @ C @ flat.T),
+        sizes=np.append(prior.sizes, 1.0),
     )
 
 
@@ -121,4 +126,9 @@ def scatter(sigma_mm: Array, sigma_rad: Array) -> Prior:
         variance = np.zeros((n, 6))
         variance[:, column] = np.asarray(sigma)[:, None] ** 2
         parts.append(np.diag(variance.ravel()))
-    return Prior(names=("shift from view to view", "turn from view to view"), parts=tuple(parts), sizes=np.ones(2))
+    return Prior(
+        names=("shift from view to view", "turn from view to view"),
+        parts=tuple(parts),
+        sizes=np.ones(2),
+        widths=np.ones(6 * n),
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from tomopose.manipulator.poses import PoseSequence
 from tomopose.provenance import provenance
 from tomopose.reconstruction.line_integrals import Correction, ImagesAre, require_contrast
 from tomopose.reconstruction.run import line_integrals_of
+from tomopose.refinement.checkpoint import checkpoint_of
 from tomopose.refinement.estimate import Estimate, Progress, Steps, estimate, levels_of
 from tomopose.refinement.halves import difference_of_halves
 from tomopose.refinement.joint_fit.fit import Fit, linearised
@@ -52,6 +54,7 @@ def refine(
     images_are: ImagesAre | None = None,
     correction: Correction | None = None,
     settings: RefineSettings | None = None,
+    checkpoint: str | Path | None = None,
     progress: Progress = None,
 ) -> Refinement:
     """Correct each view's geometry from the scan's own images: volume and poses are estimated together.
@@ -67,6 +70,8 @@ def refine(
     images_are:  "transmission", "line-integrals" or "counts"; never guessed.
     correction:  how images become line integrals (white level, bad pixels, beam hardening ...), as for `reconstruct`.
     settings:    levels, steps, held-out share, seed.
+    checkpoint:  folder in which each level's result is kept; a second call with the same images, matrices and settings
+                 continues from there.
     progress:    called with (steps done, steps in all).
 
     Returns
@@ -92,9 +97,12 @@ def refine(
     prior, stated = prior_of(matrices, grid, s, calibration, poses)
     factors = levels_of(data, s)
     steps = Steps(2 * len(factors) + 4, progress)
-    found = estimate(data, factors, prior, s, threads, steps)
+    kept = checkpoint_of(checkpoint, scan, grid, prior, s)
+    found = estimate(data, factors, prior, s, threads, steps, kept)
     result = assessed(found, matrices, s, threads, steps)
     steps.finish()
+    if kept is not None:
+        kept.remove()
     made = provenance(arguments={"prior_px": stated, "levels": list(factors)}, seed=s.seed)
     return replace(result, provenance=made)
 

@@ -20,13 +20,16 @@ AXES = ("x", "y", "z")
 @dataclass(frozen=True, kw_only=True)
 class RefinedViews:
     """columns: as `Refinement.columns`; verdict, reasons, unobservable: in words; gain: of held-out pixels, standard
-    errors; before, after: volumes under both geometries."""
+    errors; halves_px: rms difference of two halves of the views, refined apart; stated_px: the uncertainty stated for
+    all views; before, after: volumes under both geometries."""
 
     columns: Mapping[str, Sequence[object] | np.ndarray]
     verdict: str
     reasons: tuple[str, ...]
     unobservable: tuple[str, ...]
     gain: float
+    halves_px: float
+    stated_px: float
     before: Volume | None
     after: Volume | None
     provenance: Provenance | None
@@ -48,6 +51,11 @@ def refinement_report(views: RefinedViews, *, title: str = "Refinement report") 
             key_figures=[
                 KeyFigure(name="Correction", value=views.verdict),
                 KeyFigure(name="Gain of held-out pixels", note="standard errors", value=f"{views.gain:.1f}"),
+                KeyFigure(
+                    name="Uncertainty of a view",
+                    note="px a coordinate: stated, and by two halves of the views refined apart",
+                    value=f"{views.stated_px:.3g}, {views.halves_px:.3g}",
+                ),
                 KeyFigure(
                     name="Residual of a view", note="median, before and after", value=f"{before:.3g}, {after:.3g}"
                 ),

@@ -1,0 +1,115 @@
+"""Parts of the joint fit: smoothing to the grid, the preconditioner, the prior's evidence and its jumps."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tomopose as tp
+from tomopose.engines.cpu import CpuEngine
+from tomopose.refinement.joint_fit.linear import Linear
+from tomopose.refinement.joint_fit.measured import Measured
+from tomopose.refinement.joint_fit.precondition import passed_frequencies
+from tomopose.refinement.joint_fit.pyramid import SHARPEST, px_per_mm, smoothed
+from tomopose.refinement.prior import scatter
+from tomopose.refinement.uncertainty import size_sigma
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "refine"))
+import objects
+
+PANEL = objects.Panel(n_u=47, n_v=43, p_u=2.8, p_v=2.7, u_0=24.3, v_0=20.2)
+GRID = tp.VoxelGrid(shape=(23, 24, 25), spacing=0.8)
+
+
+def matrices(n=12):
+    P = objects.matrices(objects.path("seven", n), np.zeros((n, 3)), PANEL)
+    return tp.ProjectionMatrices(P=P, n_u=47, n_v=43, p_u=2.8, p_v=2.7, pose_id=tuple(map(str, range(n))))
+
+
+def data_of(p):
+    m = matrices(len(p))
+    ones = np.ones_like(p)
+    return Measured(p=p, weight=ones, judge=0 * ones, matrices=m, grid=GRID)
+
+
+def test_images_are_smoothed_to_the_edge_that_the_grid_holds_less_the_pixels_own():
+    data = data_of(np.zeros((12, 47 * 43), dtype=np.float32))
+    level = smoothed(data)
+    voxel_px = px_per_mm(data) * 0.8
+    np.testing.assert_allclose(np.square(level.blur) + 1 / 12, (SHARPEST * voxel_px) ** 2)
+    np.testing.assert_allclose(px_per_mm(data), [1200 / 2.8 / 226, 1200 / 2.7 / 226], rtol=0.01)
+
+
+def test_the_noise_left_by_the_smoothing_is_that_of_smoothed_noise():
+    level = smoothed(data_of(np.zeros((12, 47 * 43), dtype=np.float32)))
+    noise = np.random.default_rng(1).standard_normal((12, 47 * 43)).astype(np.float32)
+    assert np.std(level.smooth(noise)) == pytest.approx(level.noise_left, rel=0.03)
+
+
+def test_a_held_out_pixel_that_is_mixed_with_others_judges_no_longer():
+    p = np.zeros((12, 47, 43), dtype=np.float32)
+    judge = p.copy()
+    judge[:, 8:16, 8:16] = 1
+    level = smoothed(replace(data_of(p.reshape(12, -1)), judge=judge.reshape(12, -1)))
+    kept = level.judge.reshape(judge.shape) > 0
+    assert kept[:, 9:15, 9:15].all()
+    assert kept.sum() == 12 * 36
+
+
+def test_preconditioned_turns_come_nearer_to_the_solution_than_as_many_plain_ones():
+    m = matrices()
+    engine = CpuEngine(m, GRID, threads=1)
+    rng = np.random.default_rng(0)
+    free = np.zeros(engine.empty().shape, dtype=bool)
+    free[1:-2, 1:-2, 1:-2] = True
+    truth = np.where(free, rng.standard_normal(free.shape), 0).astype(np.float32)
+    n = len(m)
+    lines = engine.forward(truth, range(n)).transpose(0, 2, 1).reshape(n, -1)
+    J, w = np.ones((n, 1, lines.shape[1]), dtype=np.float32), np.ones_like(lines)
+
+    def left(turns, H):
+        linear = Linear.of(engine, free, J, w, 1e6 * np.eye(n), 1.0, H)
+        dx, _ = linear.solve(lines, np.zeros(n), np.zeros_like(truth), turns=turns, tolerance=0)
+        return dx
+
+    best = left(200, None)
+    H = passed_frequencies(m, GRID)
+    plain, eased = (np.linalg.norm(left(6, each) - best) for each in (None, H))
+    assert eased < 0.7 * plain
+
+
+def test_evidence_finds_the_size_of_the_scatter_and_leaves_none_where_there_is_none():
+    n, rng = 40, np.random.default_rng(3)
+    prior = scatter(np.full(n, 0.2), np.full(n, 0.02))
+    information = np.kron(np.eye(n), np.diag([1e4] * 3 + [1e6] * 3))
+    truth = rng.standard_normal((n, 6)) * np.array([0.1] * 3 + [0.0] * 3)
+    seen = truth + rng.standard_normal((n, 6)) * np.array([0.01] * 3 + [0.001] * 3)
+    posterior = np.linalg.solve(information + prior.precision, information @ seen.ravel())
+    sizes = prior.by_evidence(posterior.reshape(n, 6), information).sizes
+    assert sizes[0] == pytest.approx(0.5, rel=0.2)
+    assert sizes[1] < 0.03
+
+
+def test_a_view_that_jumps_gets_a_prior_of_its_own():
+    prior = scatter(np.full(9, 0.1), np.full(9, 0.01))
+    q = np.zeros((9, 6))
+    q[4, 0] = 2.0
+    wide = prior.with_jumps(q)
+    assert np.sqrt(wide.blocks[4, 0, 0]) == pytest.approx(0.1 * 20 / np.sqrt(6))
+    np.testing.assert_array_equal(wide.blocks[3], prior.blocks[3])
+    np.testing.assert_array_equal(wide.stated.blocks, prior.blocks)
+
+
+def test_the_size_of_the_object_is_as_uncertain_as_the_mean_depth_of_the_views():
+    m, centre = matrices(), np.zeros(3)
+    sigma = 0.3
+    prior = scatter(np.full(12, sigma), np.full(12, 1e-3))
+    x = np.array([[8.0, 0, 0], [-8, 0, 0], [0, 8, 0], [0, -8, 0], [0, 0, 8], [0, 0, -8]])
+    shared = size_sigma(prior, m.P, x, centre)
+    # a depth off by sigma / sqrt(12) of 226 mm; an image of 8 mm is 1200 / 226 / 2.8 px/mm large; seen edge-on as small
+    full = sigma / np.sqrt(12) / 226 * 8 * 1200 / 226 / 2.8
+    assert 0.3 * full < np.sqrt(np.mean(shared**2)) < full
