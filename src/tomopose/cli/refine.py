@@ -157,9 +157,8 @@ def said(o: Options, result: Refinement) -> None:
             *(f"  {reason}" for reason in result.reasons),
             f"  residual of a view, median: {np.median(result.residual_before):.3g} before, "
             f"{np.median(result.residual_after):.3g} after",
-            *([] if sigma is None else [f"  standard uncertainty of a view: {np.sqrt(np.mean(sigma**2)):.3g} px"]),
-            f"  two halves of the views, refined apart, differ by {result.halves_px:.3g} px; stated for all views: "
-            f"{result.stated_px:.3g} px",
+            f"  uncertainty of a view: {result.stated_px:.3g} px a coordinate stated, {result.halves_px:.3g} px by two "
+            "halves of the views refined apart",
             *(f"  view {result.pose_id[j]} stands out from the others" for j in result.outliers),
             *(f"  note: {sentence}" for sentence in result.unobservable),
         ],

@@ -3,6 +3,8 @@ r"""A second opinion that needs no truth: two disjoint sets of views, refined ap
 Every second view makes set A, the others set B; each is refined from the input geometry, with a volume of its own.  The
 views of B are then matched to the volume of A, held as it is, and the poses that this gives are compared with those
 that B found itself; and the other way round.  Common motions, which no image shows, are removed from the differences.
+They hold what two independent volumes lead the views apart; each view's own noise is in both poses and is added from
+its information with the volume known.
 """
 
 from __future__ import annotations
@@ -25,9 +27,18 @@ MATCHES = 3
 """Gauss-Newton steps of views to a volume that is held: they begin at poses a fraction of a pixel off."""
 
 
-def difference_of_halves(data: Measured, prior: Prior, fit: Fit, points: Array) -> float:
-    """Rms difference, px per coordinate and per half, of the views' poses by their own half and by the other one, at
-    points (m, 3) of W, in pixels of the unbinned images; NaN for fewer than 16 views."""
+def halves_px(data: Measured, prior: Prior, fit: Fit, K: Array, known_px: float) -> float:
+    """Standard uncertainty of a view, px per coordinate, by two halves; K (n, m, 2, 6) px per motion; known_px: with
+    the volume known.  NaN for fewer than 16 views.
+
+    A volume of n/2 views leads its views astray by the variance V each, two volumes by 2 V, one of n views by V/2.
+    """
+    squares = differences(data, prior, fit, K)
+    return float(np.sqrt(known_px**2 + squares / 4))
+
+
+def differences(data: Measured, prior: Prior, fit: Fit, K: Array) -> float:
+    """Mean square difference, px^2 per coordinate, of the views' poses by their own half and by the other one."""
     n = len(data.p)
     if n < FEWEST_VIEWS:
         return float("nan")
@@ -41,12 +52,9 @@ def difference_of_halves(data: Measured, prior: Prior, fit: Fit, points: Array) 
     for own, other in ((0, 1), (1, 0)):
         part, state = parts[own], found[own]
         matched = matched_to(part, replace(state, volume=found[other].volume), precisions[own], fit.threads)
-        e = difference(part, matched.q, state.q)
-        K = pixel_jacobian(part.matrices.P, points, np.asarray(part.grid.centre))
-        moved = np.einsum("nmic,nc->nmi", K, e)
+        moved = np.einsum("nmic,nc->nmi", K[rows[own]], difference(part, matched.q, state.q))
         squares, count = squares + float(np.sum(moved**2)), count + moved.size
-    # each of the two poses has an error of its own
-    return float(np.sqrt(squares / count / 2))
+    return squares / count
 
 
 def views_of(data: Measured, rows: Array) -> Measured:

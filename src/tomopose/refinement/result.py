@@ -38,8 +38,8 @@ class Refinement(Tabular):
     outliers:     indices of views whose correction stands out from the others (a jump).
     held_out_gain: mean gain over those pixels, in its own standard errors; chi: rms residual over noise of the fit.
     widening:     how much larger the uncertainty is than with the volume known.
-    halves_px, stated_px: rms difference, px per coordinate, of views refined in two disjoint sets, and the rms of the
-                  stated uncertainty of all views together beside it (a half has fewer views and is less exact).
+    halves_px:    standard uncertainty of a view, px per coordinate, by two disjoint sets of views refined apart; NaN
+                  for fewer than 16 views.  stated_px: the stated one beside it, rms over views and points.
     volume_before, volume: volumes under both geometries, at the resolution of the comparison.
     """
 

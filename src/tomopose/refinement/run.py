@@ -19,7 +19,7 @@ from tomopose.reconstruction.line_integrals import Correction, ImagesAre, requir
 from tomopose.reconstruction.run import line_integrals_of
 from tomopose.refinement.checkpoint import checkpoint_of
 from tomopose.refinement.estimate import Estimate, Progress, Steps, estimate, levels_of
-from tomopose.refinement.halves import difference_of_halves
+from tomopose.refinement.halves import halves_px
 from tomopose.refinement.joint_fit.fit import Fit, linearised
 from tomopose.refinement.joint_fit.linear import normal_blocks
 from tomopose.refinement.joint_fit.measured import measured
@@ -128,7 +128,8 @@ def assessed(
     spread = spread_of(widening, information if state.information is None else state.information, prior, K)
     steps.done()
     moved = np.sqrt(np.mean(np.einsum("nmic,nc->nmi", K, state.q) ** 2) / np.mean(spread.points_sigma**2))
-    halves = difference_of_halves(level, prior, replace(fit, steps=s.steps), points_of(data.grid))
+    known_px = float(np.sqrt(np.mean(spread.points_known**2)))
+    halves = halves_px(level, prior, replace(fit, steps=s.steps), K, known_px)
     verdict, reasons = decide(
         Evidence(
             held_out=held_out,

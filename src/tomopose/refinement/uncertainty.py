@@ -29,10 +29,12 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True, kw_only=True)
 class Spread:
-    """sigma: (n, 6), mm and rad, of each view's motion; points_sigma: (n, m), px per coordinate."""
+    """sigma: (n, 6), mm and rad, of each view's motion; points_sigma: (n, m), px per coordinate; points_known: the
+    same with the volume known."""
 
     sigma: Array
     points_sigma: Array
+    points_known: Array
 
 
 def drawn_errors(
@@ -98,6 +100,7 @@ def spread_of(widening: Widening, information: Array, prior: Prior, K: Array) ->
     return Spread(
         sigma=np.sqrt(np.minimum(np.einsum("ncc->nc", known) * widening.motions, np.einsum("ncc->nc", blocks))),
         points_sigma=np.sqrt(variance.mean(axis=2)),
+        points_known=np.sqrt(with_volume_known.mean(axis=2)),
     )
 
 

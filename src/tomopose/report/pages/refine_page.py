@@ -20,8 +20,8 @@ AXES = ("x", "y", "z")
 @dataclass(frozen=True, kw_only=True)
 class RefinedViews:
     """columns: as `Refinement.columns`; verdict, reasons, unobservable: in words; gain: of held-out pixels, standard
-    errors; halves_px: rms difference of two halves of the views, refined apart; stated_px: the uncertainty stated for
-    all views; before, after: volumes under both geometries."""
+    errors; halves_px, stated_px: uncertainty of a view by two halves of the views refined apart, and as stated;
+    before, after: volumes under both geometries."""
 
     columns: Mapping[str, Sequence[object] | np.ndarray]
     verdict: str
