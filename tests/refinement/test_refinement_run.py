@@ -110,10 +110,8 @@ def test_a_killed_refinement_continues_after_its_last_level_to_the_same_numbers(
 
 def test_poses_of_another_number_are_refused():
     images, matrices, _ = scan("none")
-    still = tp.RigidTransform(R=np.eye(3)[None], t=np.zeros((1, 3)))
-    poses = tp.PoseSequence(T_MH=still, pose_id=("a",))
-    with pytest.raises(tp.TomoposeError, match="1 poses for 24 matrices"):
-        tp.refine(images, matrices, GRID, poses=poses, images_are="transmission")
+    with pytest.raises(tp.TomoposeError, match="8 poses for 24 matrices"):
+        tp.refine(images, matrices, GRID, poses=tp.circular_scan(8), images_are="transmission")
 
 
 def test_too_few_views_are_refused():
