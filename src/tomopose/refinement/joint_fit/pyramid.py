@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import scipy.ndimage
 
-from tomopose.calibration.uncertainty.trajectory import point_jacobian
+from tomopose.geometry.object_pose import point_jacobian
 from tomopose.refinement.joint_fit.measured import Measured
 from tomopose.units import Array, Floats
 from tomopose.volume import VoxelGrid
