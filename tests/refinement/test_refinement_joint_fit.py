@@ -16,6 +16,7 @@ from tomopose.refinement.joint_fit.measured import Measured
 from tomopose.refinement.joint_fit.precondition import passed_frequencies
 from tomopose.refinement.joint_fit.pyramid import SHARPEST, px_per_mm, smoothed
 from tomopose.refinement.prior import scatter
+from tomopose.refinement.run import jumps
 from tomopose.refinement.uncertainty import size_sigma
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "refine"))
@@ -102,6 +103,14 @@ def test_a_view_that_jumps_gets_a_prior_of_its_own():
     assert np.sqrt(wide.blocks[4, 0, 0]) == pytest.approx(0.1 * 20 / np.sqrt(6))
     np.testing.assert_array_equal(wide.blocks[3], prior.blocks[3])
     np.testing.assert_array_equal(wide.stated.blocks, prior.blocks)
+
+
+def test_a_view_with_a_prior_of_its_own_is_named_however_uncertain_its_depth_is():
+    prior = scatter(np.full(9, 0.1), np.full(9, 0.01))
+    q = 0.01 * np.random.default_rng(0).standard_normal((9, 6))
+    q[4, 0] = 2.0
+    assert jumps(q, np.ones((9, 6)), prior.with_jumps(q), 10.0) == (4,)
+    assert jumps(q, np.ones((9, 6)), prior, 10.0) == ()
 
 
 def test_the_size_of_the_object_is_as_uncertain_as_the_mean_depth_of_the_views():

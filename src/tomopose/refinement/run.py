@@ -26,6 +26,7 @@ from tomopose.refinement.joint_fit.measured import measured
 from tomopose.refinement.joint_fit.motions import pixel_jacobian, transforms
 from tomopose.refinement.joint_fit.pyramid import level_of
 from tomopose.refinement.judge import Evidence, Verdict, decide, trial
+from tomopose.refinement.prior import Prior
 from tomopose.refinement.result import Refinement
 from tomopose.refinement.settings import RefineSettings
 from tomopose.refinement.stated import points_of, prior_of, radius_of
@@ -164,7 +165,7 @@ def assessed(
         converged=state.settled,
         chi=state.chi,
         prior_sizes={name: float(size) for name, size in zip(prior.names, prior.sizes, strict=True)},
-        outliers=jumps(state.q, spread.sigma, radius),
+        outliers=jumps(state.q, spread.sigma, prior, radius),
         widening=widening.factor,
         halves_px=halves,
         stated_px=float(np.sqrt(np.mean(spread.points_sigma**2))),
@@ -173,11 +174,13 @@ def assessed(
     )
 
 
-def jumps(q: Array, sigma: Array, radius: float) -> tuple[int, ...]:
-    """Views whose correction is beyond six robust standard deviations of all and four of its own uncertainty."""
+def jumps(q: Array, sigma: Array, prior: Prior, radius: float) -> tuple[int, ...]:
+    """Views whose correction is beyond six robust standard deviations of all and either beyond the scatter of the
+    others by the prior, or beyond four of its own uncertainty."""
     lever = np.array([1.0] * 3 + [radius] * 3)
     size = np.linalg.norm(q * lever, axis=1)
     middle = float(np.median(size))
     wide = MAD_TO_SIGMA * float(np.median(np.abs(size - middle)))
     own = np.linalg.norm(sigma * lever, axis=1)
-    return tuple(int(j) for j in np.flatnonzero((size > middle + 6 * wide) & (size > 4 * own)))
+    apart = prior.widths.reshape(len(q), -1).max(axis=1) > 1
+    return tuple(int(j) for j in np.flatnonzero((size > middle + 6 * wide) & (apart | (size > 4 * own))))

@@ -18,7 +18,7 @@ from tomopose.refinement.joint_fit.measured import Measured
 from tomopose.refinement.joint_fit.motions import gauge, pixel_jacobian, without_gauge
 from tomopose.refinement.joint_fit.precondition import passed_frequencies
 from tomopose.refinement.prior import Prior
-from tomopose.refinement.settings import UNDETERMINED
+from tomopose.refinement.settings import MODEL_ERROR, UNDETERMINED
 from tomopose.units import Array
 
 VOLUME_UNKNOWN = 9.0
@@ -96,9 +96,10 @@ def spread_of(widening: Widening, information: Array, prior: Prior, K: Array) ->
     known = np.linalg.inv(information + np.linalg.inv(blocks))
     with_volume_known = np.einsum("nmic,ncd,nmid->nmi", K, known, K)
     prior_points = np.einsum("nmic,ncd,nmid->nmi", K, blocks, K)
-    variance = np.minimum(with_volume_known * widening.points, np.maximum(prior_points, with_volume_known))
+    wide = MODEL_ERROR**2
+    variance = np.minimum(wide * with_volume_known * widening.points, np.maximum(prior_points, with_volume_known))
     return Spread(
-        sigma=np.sqrt(np.minimum(np.einsum("ncc->nc", known) * widening.motions, np.einsum("ncc->nc", blocks))),
+        sigma=np.sqrt(np.minimum(wide * np.einsum("ncc->nc", known) * widening.motions, np.einsum("ncc->nc", blocks))),
         points_sigma=np.sqrt(variance.mean(axis=2)),
         points_known=np.sqrt(with_volume_known.mean(axis=2)),
     )
