@@ -8,7 +8,9 @@ covariances, the first is unbiased if D ~ N(0, V); otherwise D ~ N(0, (1 + s) V)
     E x = x_first + s / (1 + s) D,    cov x = C_first + s / (1 + s) V,
 
 and the data's own s is max(D' V^-1 D / 2 - 1, 0): the shrinkage of an estimate that may be biased and one that is not
-(E. J. Green, W. E. Strawderman, J. Am. Stat. Assoc. 86 (1991) 1001).  Where every sector fits, nothing changes.
+(E. J. Green, W. E. Strawderman, J. Am. Stat. Assoc. 86 (1991) 1001).  Chance makes that positive in 37 % of images, so
+it counts by the probability that it shows more than noise (`excess_variance`).  Where every sector fits, nothing
+changes.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ def downweight_misfitting_sectors(fit: RimFit, of: Equations, *, parameters: flo
     D, V = X[:2, 2], noise * (X[:2, :2] - first) - doubt
     values, axes = np.linalg.eigh((V + V.T) / 2 + settings.negligible * noise * (first + first.T) / 2)
     V = (axes * np.maximum(values, settings.negligible * noise * values.max())) @ axes.T
-    s = max(float(D @ np.linalg.solve(V, D)) / 2 - 1.0, 0.0)
+    s = excess_variance(float(D @ np.linalg.solve(V, D)) / 2, 2.0, fit.settings.noise.rare) - 1.0
     shape = fit.parameters.shape.copy()
     shape[:2] += s / (1.0 + s) * D
     return replace(fit, parameters=fit.parameters._replace(shape=shape), doubt=doubt + s / (1.0 + s) * V)
