@@ -11,6 +11,7 @@ import pytest
 
 import tomopose as tp
 from tomopose.engines.cpu import CpuEngine
+from tomopose.refinement.estimate import levels_of
 from tomopose.refinement.joint_fit.linear import Linear
 from tomopose.refinement.joint_fit.measured import Measured
 from tomopose.refinement.joint_fit.precondition import passed_frequencies
@@ -81,6 +82,15 @@ def test_preconditioned_turns_come_nearer_to_the_solution_than_as_many_plain_one
     H = passed_frequencies(m, GRID)
     plain, eased = (np.linalg.norm(left(6, each) - best) for each in (None, H))
     assert eased < 0.7 * plain
+
+
+def test_levels_that_do_not_fit_the_memory_or_the_work_are_left_out():
+    data = data_of(np.zeros((12, 47 * 43), dtype=np.float32))
+    assert levels_of(data, tp.RefineSettings()) == (1,)
+    assert levels_of(data, tp.RefineSettings(memory_gib=0.35001)) == (16,)
+    large = replace(data, matrices=replace(data.matrices, n_u=512, n_v=500))
+    assert levels_of(large, tp.RefineSettings(memory_gib=8)) == (4, 2, 1)
+    assert levels_of(large, tp.RefineSettings(memory_gib=0.5)) == (8, 4, 2)
 
 
 def test_evidence_finds_the_size_of_the_scatter_and_leaves_none_where_there_is_none():

@@ -46,6 +46,9 @@ class Options(ScanAndGrid, CorrectedImages, WritingOptions):
             help="Folder to keep the state in; a second run with the same images and settings continues from there.",
         ),
     ] = None
+    memory: Annotated[
+        float | None, typer.Option("--memory-gib", help="Keep within this much memory: finer levels are left out.")
+    ] = None
     sigma: Annotated[
         float | None,
         typer.Option("--sigma-px", help="Prior uncertainty of a view, px; default: what the matrices state, else 1."),
@@ -78,7 +81,7 @@ def refine(options: Options) -> int:
         say, image_source(o.images), known, None, dark=o.dark, flat=o.flat, dataset=o.dataset, rows=o.rows, raw=o.raw
     )
     correction = correction_from(o, stack.rows)
-    settings = tp.RefineSettings(sigma_px=o.sigma, seed=o.seed, threads=o.workers)
+    settings = tp.RefineSettings(sigma_px=o.sigma, seed=o.seed, threads=o.workers, memory_gib=o.memory)
     with say.progress("refining") as progress:
         result = tp.refine(
             stack,

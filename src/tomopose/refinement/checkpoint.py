@@ -32,7 +32,12 @@ class Reached:
 
 
 def checkpoint_of(
-    folder: str | Path | None, scan: LineIntegrals, grid: VoxelGrid, prior: Prior, settings: RefineSettings
+    folder: str | Path | None,
+    scan: LineIntegrals,
+    grid: VoxelGrid,
+    prior: Prior,
+    settings: RefineSettings,
+    levels: tuple[int, ...],
 ) -> Checkpoint | None:
     """The checkpoint in a folder, with the key of everything that the numbers depend on; None without a folder."""
     if folder is None:
@@ -46,7 +51,8 @@ def checkpoint_of(
         detector={"n_u": m.n_u, "n_v": m.n_v, "p_u": m.p_u, "p_v": m.p_v},
         grid={"shape": grid.shape, "spacing": grid.spacing, "centre": grid.centre},
         prior=prior.covariance,
-        settings=replace(settings, threads=None),
+        settings=replace(settings, threads=None, memory_gib=None),
+        levels=levels,
     )
     return Checkpoint(Path(folder), key)
 

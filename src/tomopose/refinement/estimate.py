@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 
+from tomopose.reconstruction.memory import BASE, memory_limit, padded_bytes
 from tomopose.refinement.checkpoint import Checkpoint, Reached
 from tomopose.refinement.joint_fit.fit import Fit, State, blank
 from tomopose.refinement.joint_fit.measured import Measured, crossed_edges, crossed_faces, rays_through
 from tomopose.refinement.joint_fit.motions import pixel_jacobian
 from tomopose.refinement.joint_fit.pyramid import binned, finer, level_of
 from tomopose.refinement.prior import Prior
-from tomopose.refinement.settings import LEAST_PIXELS, MOST_SAMPLES, RefineSettings
+from tomopose.refinement.settings import IMAGE_COPIES, LEAST_PIXELS, MOST_SAMPLES, VOLUME_COPIES, RefineSettings
 from tomopose.refinement.stated import points_of
 from tomopose.refinement.uncertainty import VOLUME_UNKNOWN
 from tomopose.units import Array
@@ -141,13 +142,16 @@ def without_rays(data: Measured, faces: tuple[str, ...]) -> Measured:
 
 
 def levels_of(data: Measured, s: RefineSettings) -> tuple[int, ...]:
-    """Binnings, coarse to fine, that leave enough pixels and whose work is affordable."""
+    """Binnings, coarse to fine, that leave enough pixels and whose work and memory are affordable."""
     m, grid = data.matrices, data.grid
     if s.levels is not None:
         return tuple(sorted({int(f) for f in s.levels}, reverse=True))
+    limit = memory_limit(s.memory_gib)
 
-    def samples(f: int) -> float:
-        return len(m) * (m.n_u / f) * (m.n_v / f) * max(grid.shape) / f
+    def affordable(f: int) -> bool:
+        pixels = len(m) * (m.n_u / f) * (m.n_v / f)
+        needed = BASE + 4 * IMAGE_COPIES * pixels + VOLUME_COPIES * padded_bytes(grid) / f**3
+        return pixels * max(grid.shape) / f <= MOST_SAMPLES and (limit is None or needed <= limit)
 
-    finest = next((f for f in (1, 2, 4, 8, 16) if samples(f) <= MOST_SAMPLES), 16)
+    finest = next((f for f in (1, 2, 4, 8, 16) if affordable(f)), 16)
     return tuple(f for f in (4 * finest, 2 * finest) if min(m.n_u, m.n_v) // f >= LEAST_PIXELS) + (finest,)

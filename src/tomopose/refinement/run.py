@@ -98,7 +98,7 @@ def refine(
     prior, stated = prior_of(matrices, grid, s, calibration, poses)
     factors = levels_of(data, s)
     steps = Steps(2 * len(factors) + 4, progress)
-    kept = checkpoint_of(checkpoint, scan, grid, prior, s)
+    kept = checkpoint_of(checkpoint, scan, grid, prior, s, factors)
     found = estimate(data, factors, prior, s, threads, steps, kept)
     result = assessed(found, matrices, s, threads, steps)
     steps.finish()

@@ -35,6 +35,12 @@ MODEL_ERROR = 1.6
 that its own grid makes.  Tuned on benchmarks/refine (white scatter): without it the errors are 0.98 (balls), 1.55 (step
 cylinder) and 2.20 (ellipsoids of low contrast) times what is stated."""
 
+IMAGE_COPIES = 22
+"""float32 images alive for each view of a level: seven derivatives, six of them once more while they are put together,
+and the data, weights, residuals and projections."""
+VOLUME_COPIES = 12
+"""float32 volumes of a level: unknown, step, directions, their transforms, masks."""
+
 UNDETERMINED = 0.6
 """Posterior over prior standard uncertainty from which a direction counts as not determined by the images: the images
 then hold less than twice the information that the prior had."""
@@ -52,6 +58,7 @@ class RefineSettings:
     samples:   draws of noise from which the uncertainty with the volume unknown is estimated.
     threads:   processors to use; None for all.
     seed:      of the held-out blocks and the draws.
+    memory_gib: memory to keep within, by leaving out levels that are too fine for it; what is free unless given.
     """
 
     levels: tuple[int, ...] | None = None
@@ -62,6 +69,7 @@ class RefineSettings:
     samples: int = 4
     threads: int | None = None
     seed: int = 0
+    memory_gib: float | None = None
 
     def __post_init__(self) -> None:
         if self.levels is not None and (not self.levels or any(int(f) != f or f < 1 for f in self.levels)):
