@@ -14,11 +14,13 @@ from tomopose.engines.cpu import CpuEngine
 from tomopose.refinement.estimate import levels_of
 from tomopose.refinement.joint_fit.linear import Linear
 from tomopose.refinement.joint_fit.measured import Measured
+from tomopose.refinement.joint_fit.motions import pixel_jacobian
 from tomopose.refinement.joint_fit.precondition import passed_frequencies
 from tomopose.refinement.joint_fit.pyramid import SHARPEST, px_per_mm, smoothed
 from tomopose.refinement.prior import scatter
 from tomopose.refinement.run import jumps
-from tomopose.refinement.uncertainty import size_sigma
+from tomopose.refinement.settings import OPEN_PX
+from tomopose.refinement.uncertainty import open_directions, size_sigma
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "refine"))
 import objects
@@ -121,6 +123,17 @@ def test_a_view_with_a_prior_of_its_own_is_named_however_uncertain_its_depth_is(
     q[4, 0] = 2.0
     assert jumps(q, np.ones((9, 6)), prior.with_jumps(q), 10.0) == (4,)
     assert jumps(q, np.ones((9, 6)), prior, 10.0) == ()
+
+
+def test_a_turn_that_no_image_shows_is_open_by_what_it_leaves_in_pixels():
+    m, points = matrices(), np.array([[8.0, 0, 0], [0, 8, 0], [0, 0, 8]])
+    K = pixel_jacobian(m.P, points, np.zeros(3))
+    information = np.tile(np.diag([1e6, 1e6, 1e6, 1e8, 1e8, 0.0]), (12, 1, 1))
+    (loose,) = open_directions(information, scatter(np.full(12, 0.2), np.full(12, 0.02)), K, 10.0)
+    (tight,) = open_directions(information, scatter(np.full(12, 0.2), np.full(12, 0.0002)), K, 10.0)[-1:]
+    assert "A turn of the object about z" in loose.words
+    assert loose.left_px == pytest.approx(0.02 * np.sqrt(np.mean(K[..., 5] ** 2)))
+    assert loose.left_px > OPEN_PX > tight.left_px
 
 
 def test_the_size_of_the_object_is_as_uncertain_as_the_mean_depth_of_the_views():

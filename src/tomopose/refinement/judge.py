@@ -90,7 +90,8 @@ class Evidence:
 
     held_out: the pixels that took no part.  chi: rms residual over noise of the fit.  faces: of the grid that the
     object crosses; left: share of the rays that do not meet what lies beyond them.  edges: of the images that the
-    object crosses.  open_: directions that the images do not determine, as sentences.  moved: rms correction over its
+    object crosses.  open_: directions that the images do not determine and that
+    matter, as sentences.  moved: rms correction over its
     rms standard uncertainty.
     """
 

@@ -28,7 +28,7 @@ from tomopose.refinement.joint_fit.pyramid import level_of
 from tomopose.refinement.judge import Evidence, Verdict, decide, trial
 from tomopose.refinement.prior import Prior
 from tomopose.refinement.result import Refinement
-from tomopose.refinement.settings import RefineSettings
+from tomopose.refinement.settings import OPEN_PX, RefineSettings
 from tomopose.refinement.stated import points_of, prior_of, radius_of
 from tomopose.refinement.uncertainty import drawn_errors, open_directions, size_sigma, spread_of, widening_of
 from tomopose.units import Array
@@ -122,8 +122,8 @@ def assessed(
     here = linearised(level, at, threads=threads)
     information = normal_blocks(here.motions, here.weighed(level))
     left = float((level.weight > 0).mean()) / (1 - s.held_out) if found.faces else 1.0
-    open_ = () if found.faces else open_directions(information, prior, radius)
     K = pixel_jacobian(data.matrices.P, points_of(data.grid), centre)
+    open_ = () if found.faces else open_directions(information, prior, K, radius)
     errors = drawn_errors(level, at, here, prior, samples=s.samples, turns=s.turns, seed=s.seed)
     widening = widening_of(errors, information, prior, K)
     spread = spread_of(widening, information if state.information is None else state.information, prior, K)
@@ -138,7 +138,7 @@ def assessed(
             faces=found.faces,
             left=left,
             edges=found.edges,
-            open_=open_,
+            open_=tuple(each.words for each in open_ if each.left_px > OPEN_PX),
             moved=float(moved),
         )
     )
@@ -155,7 +155,7 @@ def assessed(
         sigma=spread.sigma,
         verdict=verdict.value,
         reasons=reasons,
-        unobservable=(*GAUGE, *open_),
+        unobservable=(*GAUGE, *(each.words for each in open_)),
         residual_before=held_out.residual_before,
         residual_after=held_out.residual_after,
         held_out_before=held_out.before,

@@ -45,6 +45,10 @@ UNDETERMINED = 0.6
 """Posterior over prior standard uncertainty from which a direction counts as not determined by the images: the images
 then hold less than twice the information that the prior had."""
 
+OPEN_PX = 0.1
+"""Px that an open direction leaves uncertain from which the correction is refused.  Less keeps the prior's value: a
+view's depth, which hardly moves a pixel, is open in most scans."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RefineSettings:

@@ -119,24 +119,35 @@ def size_sigma(prior: Prior, P: Array, points: Array, centre: Array) -> Array:
     return np.asarray(sigma * np.sqrt(np.mean(left.reshape(len(P), len(points), 2) ** 2, axis=2)))
 
 
-def open_directions(information: Array, prior: Prior, radius: float) -> tuple[str, ...]:
-    """Directions of the object's frame that no view determines, as sentences.
+@dataclass(frozen=True, kw_only=True)
+class OpenDirection:
+    """words: a sentence; left_px: rms px per coordinate that the direction leaves uncertain."""
 
-    information: (n, 6, 6) of the views with the volume held.  A direction is open where the images, the volume unknown,
-    leave more than `UNDETERMINED` of the prior that was stated.  radius: mm, of the object, in the words.
+    words: str
+    left_px: float
+
+
+def open_directions(information: Array, prior: Prior, K: Array, radius: float) -> tuple[OpenDirection, ...]:
+    """Directions of the object's frame that no view determines.
+
+    information: (n, 6, 6) of the views with the volume held; K: (n, m, 2, 6), px per motion.  A direction is open where
+    the images, the volume unknown, leave more than `UNDETERMINED` of the prior that was stated.  radius: mm, of the
+    object, in the words.
     """
     root = np.linalg.cholesky(prior.stated.blocks.mean(axis=0))
     F = root.T @ (information.mean(axis=0) / VOLUME_UNKNOWN) @ root
     values, vectors = np.linalg.eigh(F)
     left = 1 / np.sqrt(1 + np.maximum(values, 0))
-    words = []
+    found = []
     for share, vector in zip(left, vectors.T, strict=True):
         if share > UNDETERMINED:
-            words.append(
+            px = share * float(np.sqrt(np.mean((K @ (root @ vector)) ** 2)))
+            words = (
                 f"{direction_in_words(root @ vector, radius)} is not determined by these images: they leave "
-                f"{100 * share:.0f} % of the prior's uncertainty"
+                f"{100 * share:.0f} % of the prior's uncertainty, {px:.2g} px"
             )
-    return tuple(words)
+            found.append(OpenDirection(words=words, left_px=px))
+    return tuple(found)
 
 
 def direction_in_words(motion: Array, radius: float) -> str:
