@@ -45,7 +45,7 @@ def test_four_times_the_poses_take_four_times_the_memory(scanner, T_HT):
 
 
 def test_rows_looked_at_in_parts_give_the_same_explanations(scanner, T_HT, monkeypatch):
-    from tomopose.calibration.checks.score_tests import ranking, score
+    from tomopose.calibration.model import tall
 
     rng = np.random.default_rng(3)
     poses = PoseSequence.from_table(
@@ -55,8 +55,7 @@ def test_rows_looked_at_in_parts_give_the_same_explanations(scanner, T_HT, monke
     x_D = x_D + rng.normal(0, 0.01, x_D.shape) + (np.arange(90) >= 50)[:, None] * [0.2, -0.1]
     observations = BallObservations.from_sigma(x_D, 0.01, pose_id=poses.pose_id)
     whole = calibrate(scanner, poses, observations)
-    for module in (ranking, score):
-        monkeypatch.setattr(module, "PART", 16)
+    monkeypatch.setattr(tall, "PART", 16)
     parts = calibrate(scanner, poses, observations)
     assert [(e.name, e.at, e.predicts) for e in parts.explanations] == [
         (e.name, e.at, e.predicts) for e in whole.explanations

@@ -80,6 +80,8 @@ def _rigid(
     taken: Taken,
 ) -> Calibration:
     p, fit, free = solution.used, solution.fit, solution.free
+    tests = _tests(stated)  # before the fits' derivatives are held: of many balls both are large
+    stated_px = expected_px(stated.linear)
     assumed = assumed_names(free)
     chi2 = _stated_chi2(solution, stated)
     noise, scatter = None, None
@@ -119,11 +121,11 @@ def _rigid(
             status=(f"optimum of {len(p)} poses reached" if fit.converged else fit.status.value),
             misfit=stated.robust.misfit,
             expected_px=expected_px(linear),
-            stated_px=expected_px(stated.linear),
+            stated_px=stated_px,
             model="rigid",
             arrangement=arrangement,
             errors=RigidErrors(translation_scale=scale, scatter=scatter),
-            observability=observability(p, free, solution.J, assumed_jacobian(solution, assumed), assumed),
+            observability=observability(p, free, linear.J, assumed_jacobian(solution, assumed), assumed),
             diagnosis=diagnosis,
             pose_noise=noise,
             magnification_at_ball=magnification_at_balls(
@@ -131,7 +133,7 @@ def _rigid(
             ),
             assumed=taken.assumed,
             contradicted=taken.contradicted,
-            tests=_tests(stated),
+            tests=tests,
             undistinguished=taken.undistinguished,
             unseen=_unseen(solution, linear, moving_scanner=arrangement == "moving-scanner", exact=taken.exact),
             provenance=provenance(arguments=arguments),
@@ -159,7 +161,7 @@ def _tests(solution: Solution) -> ScannerTests | None:
         return None
     rows = np.flatnonzero(rows_to_test(solution.robust.keep))
     problem = solution.used if len(rows) == len(solution.used) else solution.problem.select(rows)
-    if 2 * len(problem) < solution.J.shape[2] + FEWEST_TESTED:
+    if 2 * len(problem) < len(solution.covariance) + FEWEST_TESTED:
         return None
     at = solution.at if problem is solution.used else blocks(problem, solution.free, solution.fit)
     return scanner_tests(problem, solution.free, solution.fit, at)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from tomopose.calibration.rigid.fit import (
     tangent_names,
     whitened2,
 )
-from tomopose.calibration.rigid.observability import direction_and_remedy, unobservable_directions
+from tomopose.calibration.rigid.observability import direction_and_remedy, unobservable_directions, whitened_columns
 from tomopose.calibration.rigid.outliers import RobustFit, robust_fit
 from tomopose.calibration.rigid.pose_noise import PoseNoise, estimate_pose_noise, total_covariance
 from tomopose.calibration.rigid.start import closed_form, other_starts, ray_equations
@@ -84,7 +83,7 @@ def _prior_rows(free: FreeParameters, m: int) -> Array:
 def require_observable(problem: Problem, free: FreeParameters, J: Array) -> None:
     """NotObservableError, in words, where data and priors together leave a direction unknown.  J (n, 2, m), px."""
     names = tangent_names(problem.ball_ids, free)
-    whitened = np.concatenate([(problem.W @ J).reshape(-1, J.shape[2]), _prior_rows(free, J.shape[2])])
+    whitened = np.concatenate([whitened_columns(problem, J), _prior_rows(free, J.shape[2])])
     s, bad = unobservable_directions(whitened, names)
     if bad:
         direction, remedy = direction_and_remedy(problem, names, bad[-1])
@@ -132,7 +131,7 @@ def require_length(problem: Problem, fit: Fit) -> None:
 class Solution:
     """A robust fit with all that the later steps need.
 
-    problem, used: all rows, and those not set aside;  J: (used, 2, m) px;  at: projection of the rows used.
+    problem, used: all rows, and those not set aside;  at: projection of the rows used.
     chi2: by the covariances that were used;  covariance: (m, m), widened by the rule in `uncertainty`.
     noise: the pose noise that the covariances include, or None.
     """
@@ -142,7 +141,6 @@ class Solution:
     noise: PoseNoise | None
     free: FreeParameters
     robust: RobustFit
-    J: Array
     at: ProjectionBlocks
     chi2: float
     dof: int
@@ -157,10 +155,10 @@ class Solution:
         """(used, 2) px."""
         return self.at.x_D
 
-    @cached_property
+    @property
     def linear(self) -> LinearFit:
-        """The fit of the rows used, as the checks look at it."""
-        return linearised(self.used, self.free, self.fit, self.at, self.J)
+        """The fit of the rows used, as the checks look at it: calculated anew, since of many balls it is large."""
+        return linearised(self.used, self.free, self.fit, self.at, jacobian(self.used, self.free, self.at))
 
     def at_all_rows(self) -> ProjectionBlocks:
         """Projection of all rows, those set aside included."""
@@ -207,7 +205,6 @@ def solve(
         noise=noise,
         free=free,
         robust=result,
-        J=J,
         at=b,
         chi2=chi2,
         dof=dof,
@@ -259,7 +256,8 @@ def with_pose_noise(
 
 
 def _posterior(used: Problem, solution: Solution, maker: Repeatability | None) -> PoseNoise:
-    free, at, J = solution.free, solution.at, solution.J
+    free, at = solution.free, solution.at
+    J = jacobian(solution.used, free, at)
     known = np.zeros(J.shape[2] - len(free))
     return estimate_pose_noise(
         used.covariance,

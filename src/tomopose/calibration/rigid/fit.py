@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -123,13 +122,14 @@ def blocks(problem: Problem, free: FreeParameters, fit: Fit) -> ProjectionBlocks
 
 def jacobian(problem: Problem, free: FreeParameters, b: ProjectionBlocks) -> Array:
     """(n, 2, m): derivatives of the calculated centres by w_HT, t_HT, the balls and the freed parameters, px."""
-    n, n_b = len(problem), len(problem.ball_ids)
-    J_balls = np.zeros((n, 2, 3 * n_b))
-    column = 3 * problem.ball[:, None] + np.arange(3)
-    np.put_along_axis(J_balls, np.broadcast_to(column[:, None, :], (n, 2, 3)), b.J_t, axis=2)
-    J_free: Any = b.J_scanner[:, :, free.cols] * free.factor
+    n, ball, free_from = len(problem), 6 + 3 * problem.ball, 6 + 3 * len(problem.ball_ids)
+    J = np.zeros((n, 2, free_from + len(free)))
+    J[:, :, :3], J[:, :, 3:6] = b.J_w_HT, b.J_t_HT
+    column = ball[:, None] + np.arange(3)
+    np.put_along_axis(J, np.broadcast_to(column[:, None, :], (n, 2, 3)), b.J_t, axis=2)
     mine = (free.col_run[None, :] < 0) | (free.col_run[None, :] == problem.run[:, None])
-    return np.concatenate([b.J_mount, J_balls, J_free * mine[:, None, :]], axis=2)
+    J[:, :, free_from:] = b.J_scanner[:, :, free.cols] * free.factor * mine[:, None, :]
+    return J
 
 
 def linear_fit(problem: Problem, free: FreeParameters, fit: Fit) -> LinearFit:

@@ -12,6 +12,7 @@ import numpy as np
 
 from tomopose.calibration.model.parameters import MATTERS, FreeParameters, base_name, unit_of
 from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.model.tall import is_tall, parts, triangle
 from tomopose.calibration.rigid.fit import tangent_names
 from tomopose.units import Array
 from tomopose.values import value
@@ -175,15 +176,27 @@ def assumed_report(problem: Problem, J_assumed: Array, J: Array, names: tuple[st
     return tuple(sentences)
 
 
+def whitened_columns(problem: Problem, *J: Array) -> Array:
+    """(k, m): derivatives (n, 2, m_i) px in standard deviations, side by side; of very many rows, vectors with the same
+    inner products."""
+
+    def rows(part: slice) -> Array:
+        white = [(problem.W[part] @ A[part]).reshape(-1, A.shape[2]) for A in J]
+        return white[0] if len(white) == 1 else np.concatenate(white, axis=1)
+
+    n = len(problem)
+    return triangle(rows(p) for p in parts(n)) if is_tall(2 * n) else rows(slice(0, n))
+
+
 def observability(
     problem: Problem, free: FreeParameters, J: Array, J_assumed: Array, assumed: tuple[str, ...]
 ) -> Observability:
     """The report of a fit; J (n, 2, m) and J_assumed (n, 2, a) in px, without priors."""
     names = tangent_names(problem.ball_ids, free)
-    whitened = (problem.W @ J).reshape(-1, J.shape[2])
-    s, bad = unobservable_directions(whitened, names)
+    whitened = whitened_columns(problem, J, J_assumed)
+    s, bad = unobservable_directions(whitened[:, : len(names)], names)
     pairs = [direction_and_remedy(problem, names, v) for v in bad]
-    notes = assumed_report(problem, (problem.W @ J_assumed).reshape(len(whitened), len(assumed)), whitened, assumed)
+    notes = assumed_report(problem, whitened[:, len(names) :], whitened[:, : len(names)], assumed)
     return Observability(
         singular_values=s,
         unobservable=tuple(w for w, _ in pairs),

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.model.tall import parts
 from tomopose.units import Array
 
 ROUNDS = 2
@@ -108,18 +109,25 @@ class _Stack:
 def _positions(s: _Stack, R_HT: Array) -> tuple[Array, Array]:
     """t_HT (a, 3) and t (a, balls, 3) that fit best under given R_HT (a, 3, 3): linear."""
     a, k = s.t.shape[:2]
-    nR = (s.n.reshape(a, 2 * k, 3) @ R_HT).reshape(a, k, 2, 3)
-    A: Array = np.zeros((a, k, 2, 3 + 3 * s.balls))
-    A[..., :3] = s.n
-    if s.balls == 1:
-        A[..., 3:] = nR @ s.R
-    else:
-        column = 3 + 3 * s.ball[:, :, None] + np.arange(3)
-        np.put_along_axis(A, np.broadcast_to(column[:, :, None, :], (a, k, 2, 3)), nR @ s.R, axis=3)
-    b = -s.d - (nR @ s.t[..., None])[..., 0]
-    A = A.reshape(a, 2 * k, -1)
-    At = np.swapaxes(A, 1, 2)
-    x = _solve(At @ A, (At @ b.reshape(a, 2 * k, 1))[..., 0])
+    m = 3 + 3 * s.balls
+    N, g = np.zeros((a, m, m)), np.zeros((a, m))
+    for some in parts(k):
+        n, R = s.n[:, some], s.R[:, some]
+        size = n.shape[1]
+        nR = (n.reshape(a, 2 * size, 3) @ R_HT).reshape(a, size, 2, 3)
+        A: Array = np.zeros((a, size, 2, m))
+        A[..., :3] = n
+        if s.balls == 1:
+            A[..., 3:] = nR @ R
+        else:
+            column = 3 + 3 * s.ball[:, some, None] + np.arange(3)
+            np.put_along_axis(A, np.broadcast_to(column[:, :, None, :], (a, size, 2, 3)), nR @ R, axis=3)
+        b = -s.d[:, some] - (nR @ s.t[:, some, :, None])[..., 0]
+        A = A.reshape(a, 2 * size, m)
+        At = np.swapaxes(A, 1, 2)
+        N += At @ A
+        g += (At @ b.reshape(a, 2 * size, 1))[..., 0]
+    x = _solve(N, g)
     return x[:, :3], x[:, 3:].reshape(a, s.balls, 3)
 
 

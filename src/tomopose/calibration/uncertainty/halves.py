@@ -16,6 +16,7 @@ from scipy.special import chdtrc
 from tomopose.calibration.model.budget import Halves
 from tomopose.calibration.model.covariance import inverse_information
 from tomopose.calibration.model.linear_fit import LinearFit
+from tomopose.calibration.model.tall import parts
 from tomopose.units import Array
 
 FEWEST = 4
@@ -45,14 +46,13 @@ def halves_of(linear: LinearFit, J: Array, x_D: Array, *, widening: float) -> Ha
     pull = linear.prior_rows.T @ linear.prior_residuals
     shift, spread, inverses = np.zeros(m), np.zeros((m, m)), []
     for sign, rows in zip((1.0, -1.0), near_and_far(linear), strict=True):
-        A, r = linear.J_white[rows].reshape(-1, m), linear.r_white[rows].ravel()
-        if len(A) < m - len(linear.prior_rows) + FEWEST:
+        if 2 * len(rows) < m - len(linear.prior_rows) + FEWEST:
             return None
-        F = A.T @ A
+        F, g = _normal_equations(linear, rows)
         if not (np.diag(F + P) > 0).all():
             return None
         inverse = inverse_information(F + P)
-        shift += sign * (inverse @ (A.T @ r + pull))
+        shift += sign * (inverse @ (g + pull))
         spread += inverse @ F @ inverse
         inverses.append(inverse)
     apart = inverses[0] - inverses[1]
@@ -67,6 +67,17 @@ def halves_of(linear: LinearFit, J: Array, x_D: Array, *, widening: float) -> Ha
         stated_px=float(np.sqrt(np.mean(sigma**2))),
         p=_chance(shift, C),
     )
+
+
+def _normal_equations(linear: LinearFit, rows: np.ndarray) -> tuple[Array, Array]:
+    """J^T W^T W J (m, m) and J^T W^T W r (m,) of some rows."""
+    m = linear.J.shape[2]
+    F, g = np.zeros((m, m)), np.zeros(m)
+    for part in parts(len(rows)):
+        A, r = linear.J_white[rows[part]].reshape(-1, m), linear.r_white[rows[part]].ravel()
+        F += A.T @ A
+        g += A.T @ r
+    return F, g
 
 
 def _chance(shift: Array, C: Array) -> float:

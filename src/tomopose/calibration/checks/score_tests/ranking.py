@@ -20,17 +20,15 @@ import numpy as np
 
 from tomopose.calibration.checks.score_tests.effects import Columns, Effect, Steps, white_columns
 from tomopose.calibration.checks.score_tests.score import (
-    PART,
     SEEN,
     Beside,
     Whitened,
     best_step,
     gain_of,
     in_pixels,
-    parts,
-    triangle,
 )
 from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.model.tall import is_tall, parts, triangle
 from tomopose.units import Array
 from tomopose.values import value
 
@@ -123,7 +121,7 @@ class _Products:
 
     @classmethod
     def of(cls, problem: Problem, columns: Sequence[Columns], white: Whitened) -> _Products:
-        if len(white.r) <= 2 * PART:
+        if not is_tall(len(white.r)):
             each = white_columns(problem, columns)
             beside, C = white.beside, np.concatenate(each, axis=1)
         else:

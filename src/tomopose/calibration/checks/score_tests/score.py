@@ -11,7 +11,6 @@ of chi2.  Only inner products enter, so that very long tables are replaced by th
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,6 +21,7 @@ from numba import njit
 from tomopose.calibration.model.ball_projection import ProjectionBlocks
 from tomopose.calibration.model.parameters import FreeParameters
 from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.model.tall import is_tall, parts, triangle
 from tomopose.calibration.rigid.fit import Fit, jacobian, linearised
 from tomopose.units import Array
 
@@ -30,14 +30,6 @@ SEEN = 1e-6
 
 RANK = 1e-9
 """Singular values of the normalised Jacobian, relative to the largest, that count as directions of the fit."""
-
-PART = 8192
-"""Rows (of two numbers each) that are looked at together: some megabytes of candidate columns."""
-
-
-def parts(n: int) -> list[slice]:
-    """The rows 0 .. n-1 in parts of at most `PART`."""
-    return [slice(first, min(first + PART, n)) for first in range(0, n, PART)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,15 +69,6 @@ def whitened(problem: Problem, free: FreeParameters, fit: Fit, b: ProjectionBloc
     return Whitened(r=linear.residuals, A=linear.rows, n=len(problem))
 
 
-def triangle(blocks_of_rows: Iterable[Array]) -> Array:
-    """(c, c), or fewer rows: vectors with the inner products of the columns of all rows (k, c) together."""
-    found: Array = np.zeros((0, 0))
-    for rows in blocks_of_rows:
-        together = rows if not found.size else np.concatenate([found, rows])
-        found = np.asarray(np.linalg.qr(together, mode="r")) if len(together) > together.shape[1] else together
-    return found
-
-
 @dataclass(frozen=True, kw_only=True)
 class Beside:
     """What a fit can follow: an orthonormal basis Q (k, q), as it is or, of very many rows, as A T with A (k, m) and
@@ -100,7 +83,7 @@ class Beside:
         """Of whitened rows A (k, m) and residuals r (k,)."""
         norm, k = np.linalg.norm(A, axis=0), len(A)
         unit = 1.0 / np.where(norm > 0, norm, 1.0)
-        if k <= 2 * PART:
+        if not is_tall(k):
             U, s, _ = np.linalg.svd(A * unit, full_matrices=False)
             made = cls(A=np.ascontiguousarray(U[:, s > RANK * s[0]]), T=None, rest=r)
         else:
