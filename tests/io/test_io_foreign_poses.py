@@ -50,6 +50,48 @@ def test_a_table_holds_the_digits_of_the_log(write):
     assert "-0.0000100,1.20,3,0.10,-0.0000,5e-3" in table_text(log.table())
 
 
+TARGET = "[[{x},-20.5,433.1],[0.7071068,0,0.7071068,0],[0,0,-1,0],[9E+09,9E+09,9E+09,9E+09,9E+09,9E+09]]"
+RAPID = f"""MODULE Scan
+  PERS tooldata tBall:=[TRUE,[[0,0,120],[1,0,0,0]],[1,[0,0,1],[1,0,0,0],0,0,0]];
+  PERS wobjdata wTable:=[FALSE,TRUE,"",[[500,0,400],[1,0,0,0]],[[0,0,0],[1,0,0,0]]];
+  VAR pose peShift:=[[1,2,3],[1,0,0,0]];
+  LOCAL CONST robtarget p10:=
+    {TARGET.format(x=600)};
+  VAR robtarget p20;
+  PROC main()
+    MoveJ P10, v100, fine, tBall\\WObj:=wTable;
+    MoveL {TARGET.format(x=610)}, v100, fine, tBall\\WObj:=wTable;
+    p20 := {TARGET.format(x=620)};
+    MoveL p20, v100, fine, tBall\\WObj:=wTable;
+    p20 := {TARGET.format(x=630)};
+    MoveL p20, v100, fine, tBall\\WObj:=wTable;
+    MoveL p10, v100, fine, tBall\\WObj:=wTable;
+  ENDPROC
+ENDMODULE
+"""
+
+
+def test_a_rapid_module_gives_the_targets_of_its_moves_and_no_tool_or_work_object(write):
+    log = tp.read_pose_log(write("scan.mod", RAPID))
+    assert [float(row[0]) for row in log.rows] == [600, 610, 620, 630, 600]
+    assert log.pose_id == ("p10", "line 10", "p20", "p20#2", "p10#2")
+
+
+def test_a_target_of_another_module_is_refused_because_the_poses_after_it_would_move_up(write):
+    with pytest.raises(InputError, match="line 15: the file does not hold the target 'p30'"):
+        tp.read_pose_log(write("scan.mod", RAPID.replace("MoveL p10, v100", "MoveL p30, v100")))
+
+
+def test_frames_of_a_kuka_list_are_no_poses_beside_its_positions(write):
+    point = "{X 812.5,Y -12.25,Z 905,A 12.5,B -3.25,C 178.5"
+    text = "DEFDAT RUN\nDECL FRAME BALL={X 0.0,Y 0.0,Z 120.0,A 0.0,B 0.0,C 0.0}\n"
+    log = tp.read_pose_log(write("run.dat", text + f"DECL E6POS XP1={point},S 2,T 2}}\nENDDAT\n"))
+    assert log.pose_id == ("XP1",)
+    assert "frames that no move visits are left out: BALL" in log.notes
+    alone = tp.read_pose_log(write("frames.dat", f"DEFDAT RUN\nDECL FRAME F1={point}}}\nENDDAT\n"))
+    assert alone.pose_id == ("F1",)
+
+
 @pytest.mark.parametrize("language", list(WRITERS))
 def test_what_plan_writes_as_commands_is_read_back_to_the_same_poses(language, write, rng):
     n = 12

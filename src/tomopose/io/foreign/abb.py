@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 
 from tomopose.errors import InputError
 from tomopose.io.foreign.foreign_file import ForeignFile
@@ -20,19 +21,27 @@ _N = rf"\s*({NUM})\s*"
 TARGET = re.compile(rf"\[\s*\[{_N},{_N},{_N}\]\s*,\s*\[{_N},{_N},{_N},{_N}\](?P<rest>[^;]*)")
 JOINTS = re.compile(rf"\[\s*\[{_N},{_N},{_N},{_N},{_N},{_N}\]\s*,\s*\[")
 NAMED = re.compile(r"\b(?:robtarget|jointtarget)\s+(\w+)\s*:=", re.IGNORECASE)
+ASSIGNED = re.compile(r"^\s*(\w+)\s*:=")
+OTHER_DATA = re.compile(r"\b(?:CONST|PERS|VAR)\s+(?!robtarget\b|jointtarget\b)\w+\s+(\w+)", re.IGNORECASE)
+"""Tools, work objects, loads and poses hold a position and a quaternion too, and are nowhere that the robot goes."""
 MOVE = re.compile(r"\bMove(?P<kind>L|J|C|AbsJ)\w*\s*(?P<to>[^;]*);", re.IGNORECASE)
 COMPUTED = re.compile(r"\b(Offs|RelTool)\s*\(", re.IGNORECASE)
 EXTERNAL = re.compile(rf"\[((?:\s*{NUM}\s*,){{5}}\s*{NUM}\s*)\]\s*\]")
+HOME = re.compile(r"[pj]?_?home\w*", re.IGNORECASE)
 UNUSED_AXIS = 9e8
 """RAPID writes 9E9 for an external axis that is not there."""
 
 
 @dataclass(frozen=True)
 class _Target:
-    name: str
+    name: str  # of the declaration, "" where the target is written in a move or stands alone
     words: Row
     line: int
     external: str
+
+    @property
+    def key(self) -> str:
+        return self.name or f"line {self.line}"
 
 
 def recognise(file: ForeignFile) -> bool:
@@ -55,19 +64,11 @@ def read(file: ForeignFile, options: PoseOptions) -> PoseLog:
             f"{file.path}: line {computed}: the target is computed (Offs, RelTool), which the file does not state; "
             "log the robot's positions (CRobT), or write the targets out"
         )
-    named = {t.name: t for t in targets if t.name}
-    inline = [t for t in targets if not t.name]
-    notes: tuple[str, ...] = ()
-    chosen = inline
-    if named and not inline:
-        visited = [w for _, kind, to in moves for w in [_name(kind, to)] if w]
-        names, notes = visiting_order(list(named), visited)
-        chosen = [named[n] for n in names]
-    elif named:
-        notes = (f"declared targets are left out beside those written in the moves: {some(list(named))}",)
+    named = any(t.name for t in targets)
+    chosen, notes = _visited(file.path, targets, moves) if named else (targets, ())
     said = remarks.columns() if len(remarks.ids) == len(chosen) else {}
-    if "pose_id" not in said and not inline:
-        said["pose_id"] = numbered([t.name for t in chosen])
+    if "pose_id" not in said and named:
+        said["pose_id"] = numbered([t.key for t in chosen])
     log = PoseLog(
         path=file.path,
         convention="abb",
@@ -81,6 +82,34 @@ def read(file: ForeignFile, options: PoseOptions) -> PoseLog:
     return log.with_notes(_frames(file, moves), _external(chosen))
 
 
+def _visited(
+    path: Path, targets: list[_Target], moves: list[tuple[int, str, str]]
+) -> tuple[list[_Target], tuple[str, ...]]:
+    """The targets in the order in which the moves go there, named or written in the move, and what is left out.
+
+    InputError for a target that the file does not hold: without it the poses after it would belong to other images.
+    """
+    left: list[str] = []
+    visited: list[_Target] = []
+    for line, kind, to in moves:
+        name = _name(kind, to)
+        key = (name or f"line {line}").lower()
+        known = [t for t in targets if t.key.lower() == key]
+        if known:  # a target that is assigned anew counts as the program's text has it at the move
+            visited.append(([t for t in known if t.line <= line] or known)[-1])
+        elif HOME.fullmatch(name):
+            left.append(name)
+        elif kind != "absj":
+            raise InputError(
+                f"{path}: line {line}: the file does not hold the target {name or to[:30]!r}; add its declaration from "
+                "the module that holds it, or log the robot's positions (CRobT)"
+            )
+    _, notes = visiting_order([t.key for t in targets], [t.key for t in visited])
+    if left:
+        notes += (f"moves without a position are left out: {some(list(dict.fromkeys(left)))}",)
+    return visited or targets, notes
+
+
 def _code(line: str) -> str:
     """A line without its remark."""
     return line.split("!", 1)[0]
@@ -88,15 +117,21 @@ def _code(line: str) -> str:
 
 def _targets(file: ForeignFile, pattern: re.Pattern[str]) -> tuple[list[_Target], Remarks]:
     found, remarks = [], Remarks()
+    others = {name.lower() for line in file.lines for name in OTHER_DATA.findall(_code(line))}
+    name = ""  # of the declaration or assignment that this line belongs to
     for number, line in enumerate(file.lines, start=1):
         remarks.line(line)
         code = _code(line)
-        name = NAMED.search(code)
-        for match in pattern.finditer(code):
+        if begun := NAMED.search(code) or OTHER_DATA.search(code) or ASSIGNED.search(code):
+            name = begun[1]
+        targets = [] if name.lower() in others else list(pattern.finditer(code))
+        for match in targets:
             words = tuple(number_word(w, f"{file.path}: line {number}") for w in match.groups()[:7] if w is not None)
             rest = EXTERNAL.search(match.group(0))
-            found.append(_Target(name[1] if name else "", words, number, rest[1] if rest else ""))
+            found.append(_Target(name, words, number, rest[1] if rest else ""))
             remarks.pose()
+        if ";" in code:
+            name = ""
     return found, remarks
 
 

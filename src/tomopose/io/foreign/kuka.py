@@ -44,6 +44,7 @@ class _Point:
     name: str
     values: dict[str, str]
     line: int
+    frame: bool = False  # declared as FRAME: a tool, a base or an offset, where other points are declared as positions
 
 
 def recognise(file: ForeignFile) -> bool:
@@ -83,12 +84,15 @@ def _program(file: ForeignFile) -> PoseLog:
         if left:
             notes += (f"moves without a position are left out: {some(list(dict.fromkeys(left)))}",)
     else:
-        visited = list(points.values())
+        positions = [p for p in points.values() if not p.frame]
+        visited = positions or list(points.values())
+        if len(visited) < len(points):
+            notes = (f"frames that no move visits are left out: {some([p.name for p in points.values() if p.frame])}",)
     frames = [p for p in visited if all(a in p.values for a in FRAME)]
     chosen, kind = (frames, FRAME) if frames else ([p for p in visited if all(a in p.values for a in AXES)], AXES)
     if not chosen:
         raise InputError(f"{file.path}: no point has X, Y, Z, A, B and C, and none has A1 to A6")
-    joint = [p.name for p in visited if p not in chosen]
+    joint = [p.name or f"line {p.line}" for p in visited if p not in chosen]
     if joint:
         notes += (f"positions that are no full pose are left out: {some(joint)}",)
     rows = tuple(_row(p.values, kind, f"{file.path}: line {p.line}") for p in chosen)
@@ -114,7 +118,8 @@ def _points(file: ForeignFile) -> dict[str, _Point]:
     for number, line in enumerate(file.lines, start=1):
         match = DECLARATION.match(line)
         if match and match["type"].upper() != "FDAT":
-            found[match["name"]] = _Point(match["name"], pairs_of(match["body"], r"\s"), number)
+            frame = match["type"].upper() == "FRAME"
+            found[match["name"]] = _Point(match["name"], pairs_of(match["body"], r"\s"), number, frame)
     return found
 
 
