@@ -50,6 +50,15 @@ def test_a_table_holds_the_digits_of_the_log(write):
     assert "-0.0000100,1.20,3,0.10,-0.0000,5e-3" in table_text(log.table())
 
 
+POINT = "{UF : 1, UT : 2, CONFIG : 'N U T', X = 612.5 mm, Y = -30 mm, Z = 410 mm, W = 179 deg, P = 1 deg, R = 12 deg}"
+FANUC = "/PROG SCAN\n/MN\n   1:L P[1] 100mm/sec FINE ;\n   2:L P[2] 100mm/sec FINE ;\n/POS\n" + "".join(
+    f"P[{k}]{{\n   GP1:\n{POINT[1:-1]}\n}};\n" for k in (1, 2)
+)
+YASKAWA = (
+    "/JOB\n//NAME SCAN\n//POS\n///USER 1\n///TOOL 0\n///POSTYPE USER\n///RECTAN\n"
+    "P00001=612.5,-30,410,179.5,0.25,12\nP00002=622.5,-30,410,179.5,0.25,12\n"
+    "//INST\nNOP\nMOVL P00001 V=100.0\nMOVL P00002 V=100.0\nEND\n"
+)
 TARGET = "[[{x},-20.5,433.1],[0.7071068,0,0.7071068,0],[0,0,-1,0],[9E+09,9E+09,9E+09,9E+09,9E+09,9E+09]]"
 RAPID = f"""MODULE Scan
   PERS tooldata tBall:=[TRUE,[[0,0,120],[1,0,0,0]],[1,[0,0,1],[1,0,0,0],0,0,0]];
@@ -90,6 +99,36 @@ def test_frames_of_a_kuka_list_are_no_poses_beside_its_positions(write):
     assert "frames that no move visits are left out: BALL" in log.notes
     alone = tp.read_pose_log(write("frames.dat", f"DEFDAT RUN\nDECL FRAME F1={point}}}\nENDDAT\n"))
     assert alone.pose_id == ("F1",)
+
+
+def test_a_script_target_that_is_assigned_anew_counts_as_it_is_at_each_move(write):
+    lines = ["def scan():"]
+    for x in (0.45, 0.46):
+        lines += [f"  target=p[{x},-0.12,0.33,0,3.14,0]", "  movel(target, a=1.2, v=0.25)"]
+    lines += ["  movel(p[0.47,-0.12,0.33,0,3.14,0], a=1.2, v=0.25)", "end"]
+    log = tp.read_pose_log(write("scan.script", "\n".join(lines)))
+    assert [float(row[0]) for row in log.rows] == [450, 460, 470]
+    assert log.pose_id == ("target", "target#2", "line 6")
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("scan.ls", "FINE", "FINE INC"),
+        ("scan.ls", "FINE", "FINE Offset,PR[3]"),
+        ("scan.jbi", "MOVL P00002 V=100.0", "IMOV P00002 V=100.0"),
+    ],
+)
+def test_a_move_that_is_relative_or_shifted_is_refused(name, old, new, write):
+    text = FANUC if name == "scan.ls" else YASKAWA
+    assert len(tp.read_pose_log(write(name, text)).rows) == 2
+    with pytest.raises(InputError, match=r"does not state|relative to where"):
+        tp.read_pose_log(write("shifted." + name.rpartition(".")[2], text.replace(old, new)))
+
+
+def test_moves_to_registers_that_a_listing_does_not_hold_are_named(write):
+    log = tp.read_pose_log(write("scan.ls", FANUC.replace("/POS", "   3:J PR[1:HOME] 100% FINE ;\n/POS")))
+    assert any("PR[1:HOME]" in note for note in log.notes)
 
 
 @pytest.mark.parametrize("language", list(WRITERS))

@@ -18,6 +18,11 @@ FRAME = ("X", "Y", "Z", "W", "P", "R")
 JOINTS = ("J1", "J2", "J3", "J4", "J5", "J6")
 POINT = re.compile(r"\bP\[\s*(?P<n>\d+)\s*(?::[^\]]*)?\]\s*\{(?P<body>.*?)\}\s*;", re.DOTALL)
 MOVE = re.compile(r"^\s*\d*\s*:\s*[JLCA]\s+P\[\s*(\d+)[^\]]*\]", re.MULTILINE)
+SHIFTED = re.compile(
+    r"^\s*\d*\s*:\s*[JLCA]\s+PR?\[[^\]]*\].*?\b(?P<how>INC|(?:Tool_)?Offset|VOFFSET)\b", re.MULTILINE | re.IGNORECASE
+)
+"""A move relative to the point before, or shifted by a register that the listing does not hold."""
+REGISTER = re.compile(r"^\s*\d*\s*:\s*[JLCA]\s+(PR\[[^\]]*\])", re.MULTILINE)
 SECOND_GROUP = re.compile(r"\bGP[2-9]\s*:.*", re.DOTALL)
 
 
@@ -39,7 +44,14 @@ def read(file: ForeignFile, options: PoseOptions) -> PoseLog:
         lines[match["n"]] = file.text[: len(program) + 4 + match.start()].count("\n") + 1
     if not found:
         raise InputError(f"{file.path}: the section /POS holds no point P[n]{{ ... }};")
+    if shifted := SHIFTED.search(program):
+        raise InputError(
+            f"{file.path}: {shifted[0].strip()!r} goes to a place that the listing does not state ({shifted['how']}); "
+            "write absolute points, or record the robot's positions"
+        )
     names, notes = visiting_order(list(found), MOVE.findall(program))
+    if registers := list(dict.fromkeys(REGISTER.findall(program))):
+        notes += (f"moves to position registers, which the listing does not hold, are left out: {some(registers)}",)
     frames = [n for n in names if all(a in found[n] for a in FRAME)]
     kind, chosen = (FRAME, frames) if frames else (JOINTS, [n for n in names if all(a in found[n] for a in JOINTS)])
     if not chosen:

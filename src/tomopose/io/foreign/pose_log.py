@@ -160,7 +160,10 @@ def visiting_order(declared: Sequence[str], visited: Sequence[str]) -> tuple[lis
     if not known:
         return list(declared), ()
     left = [name for name in declared if name not in known]
+    lost = [name for name in dict.fromkeys(visited) if name and name not in declared]
     notes: tuple[str, ...] = (f"points that no move visits are left out: {some(left)}",) if left else ()
+    if lost:
+        notes += (f"moves without a position are left out: {some(lost)}",)
     if known != [name for name in declared if name in known]:
         notes += ("the poses are in the order of the moves, not of the declarations",)
     return known, notes

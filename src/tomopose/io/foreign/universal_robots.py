@@ -58,7 +58,8 @@ def read_script(file: ForeignFile, options: PoseOptions) -> PoseLog:
             moves.append(("", poses[-1], number))
             remarks.pose()
         elif move:
-            moves.append((move["to"].strip(), None, number))
+            to = move["to"].strip()  # as the script has it here; it may be assigned anew
+            moves.append((to, named[to][0] if to in named else None, number))
         elif poses and (name := ASSIGNED.match(code)):
             named[name["name"]] = poses[0], number
         elif poses and not NO_POSE.search(code):
@@ -78,16 +79,19 @@ def _chosen(
 ) -> PoseLog:
     notes: tuple[str, ...] = ("m and rotation vectors in rad; x, y, z are written in mm",)
     said: dict[str, tuple[str, ...]] = {}
-    direct = [(row, line) for _, row, line in moves if row is not None]
+    direct = [(name, row, line) for name, row, line in moves if row is not None]
     if direct:
-        rows, said = direct, remarks.columns()
+        rows, names = [(row, line) for _, row, line in direct], [name for name, _, _ in direct]
         lost = [name for name, row, _ in moves if row is None]
         if lost:
             notes += (f"moves to joint positions or names are left out: {some(lost)}",)
+        if any(names):
+            _, more = visiting_order(list(named), [name for name in names if name])
+            notes, said = (*notes, *more), {"pose_id": numbered([n or f"line {k}" for n, _, k in direct])}
+        else:
+            said = remarks.columns()
     elif named:
-        names, more = visiting_order(list(named), [name for name, _, _ in moves])
-        rows, notes = [named[n] for n in names], (*notes, *more)
-        said = {"pose_id": numbered(names)}
+        rows, said = list(named.values()), {"pose_id": tuple(named)}
     else:
         rows = alone
     if not rows:

@@ -18,6 +18,8 @@ POSITION = re.compile(r"^\s*(?P<name>[CP]\d{3,5})\s*=\s*(?P<values>.+?)\s*$")
 HEADING = re.compile(r"^\s*///\s*(?P<key>[A-Z]+)\s*(?P<value>.*?)\s*$")
 MOVE = re.compile(r"^\s*S?MOV[JLCS]\b.*?\b([CP]\d{3,5})\b")
 
+SHIFTED = re.compile(r"^\s*(IMOV|SFTON)\b")
+
 
 def recognise(file: ForeignFile) -> bool:
     """A job: it begins with /JOB."""
@@ -44,6 +46,11 @@ def read(file: ForeignFile, options: PoseOptions) -> PoseLog:
             found[position["name"]] = tuple(number_word(w, f"{file.path}: line {number}") for w in words[:6])
             lines[position["name"]] = number
             frames.append(f"tool {said['TOOL']} in {said['POSTYPE']} {said['USER']}".strip())
+        elif SHIFTED.match(line):
+            raise InputError(
+                f"{file.path}: line {number}: {line.strip()[:40]!r} moves relative to where the robot is; write "
+                "absolute positions, or record them"
+            )
         elif move := MOVE.match(line):
             visited.append(move[1])
     if not found:
