@@ -23,6 +23,8 @@ from tomopose.units import Array
 NOTHING_LEFT_PX = 0.02
 """Rms errors of the views, px, by the evidence, below which finer levels are left out: what images of 100 px reach with
 the object known."""
+FEWEST_RAYS = 0.2
+"""Share of the rays below which those that are left determine no volume: all are fitted, and the verdict says so."""
 LATER_LOOK = 2.0
 """Factor by which a look at the evidence after the first one may change the prior's sizes."""
 Progress = Callable[[int, int], None] | None
@@ -133,10 +135,12 @@ def by_evidence(prior: Prior, state: State, *, most: float) -> Prior:
 
 
 def without_rays(data: Measured, faces: tuple[str, ...]) -> Measured:
-    """The data with the rays left out that cross one of the grid's faces."""
+    """The data with the rays left out that cross one of the grid's faces, where enough of them remain."""
     if not faces:
         return data
     through = rays_through(data, faces)
+    if float(through.mean()) > 1 - FEWEST_RAYS:
+        return data
     zero = np.float32(0)
     return replace(data, weight=np.where(through, zero, data.weight), judge=np.where(through, zero, data.judge))
 

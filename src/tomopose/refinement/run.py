@@ -22,7 +22,7 @@ from tomopose.refinement.estimate import Estimate, Progress, Steps, estimate, le
 from tomopose.refinement.halves import halves_px
 from tomopose.refinement.joint_fit.fit import Fit, linearised
 from tomopose.refinement.joint_fit.linear import normal_blocks
-from tomopose.refinement.joint_fit.measured import measured
+from tomopose.refinement.joint_fit.measured import measured, rays_through
 from tomopose.refinement.joint_fit.motions import pixel_jacobian, transforms
 from tomopose.refinement.joint_fit.pyramid import level_of
 from tomopose.refinement.judge import Evidence, Verdict, decide, trial
@@ -121,7 +121,7 @@ def assessed(
     at = replace(after, q=state.q)
     here = linearised(level, at, threads=threads)
     information = normal_blocks(here.motions, here.weighed(level))
-    left = float((level.weight > 0).mean()) / (1 - s.held_out) if found.faces else 1.0
+    left = 1.0 - float(rays_through(level, found.faces).mean()) if found.faces else 1.0
     K = pixel_jacobian(data.matrices.P, points_of(data.grid), centre)
     open_ = () if found.faces else open_directions(information, prior, K, radius)
     errors = drawn_errors(level, at, here, prior, samples=s.samples, turns=s.turns, seed=s.seed)
