@@ -100,19 +100,25 @@ class AlgorithmOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExecutionOptions:
-    """Where and within what it runs."""
+class KeptOptions:
+    """Where the state of unfinished work is kept."""
 
-    memory: Annotated[float | None, typer.Option("--memory-gib", help="Keep within this much memory.")] = None
-    scratch: Annotated[
-        Path | None, typer.Option("--scratch", help="Folder for the slabs of a volume that does not fit the memory.")
-    ] = None
     checkpoint: Annotated[
         Path | None,
         typer.Option(
             "--checkpoint",
             help="Folder to keep the state in; a second run with the same images and settings continues from there.",
         ),
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExecutionOptions(KeptOptions):
+    """Where and within what it runs."""
+
+    memory: Annotated[float | None, typer.Option("--memory-gib", help="Keep within this much memory.")] = None
+    scratch: Annotated[
+        Path | None, typer.Option("--scratch", help="Folder for the slabs of a volume that does not fit the memory.")
     ] = None
     dask: DaskOption = None
 

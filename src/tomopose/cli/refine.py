@@ -10,7 +10,7 @@ import typer
 
 from tomopose.cli.common import NOT_TRUSTWORTHY, OK, arguments
 from tomopose.cli.options import WritingOptions, add_command
-from tomopose.cli.reconstruct import CorrectedImages, ScanAndGrid, correction_from, grid_from
+from tomopose.cli.reconstruct import CorrectedImages, KeptOptions, ScanAndGrid, correction_from, grid_from
 
 if TYPE_CHECKING:
     from tomopose import Provenance, Refinement
@@ -27,7 +27,7 @@ def register(app: typer.Typer) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(ScanAndGrid, CorrectedImages, WritingOptions):
+class Options(ScanAndGrid, CorrectedImages, KeptOptions, WritingOptions):
     """The options of `tomopose refine`."""
 
     size: Annotated[str, typer.Option("--size", help="Voxels along each axis, N or NX,NY,NZ: the whole object.")]
@@ -38,13 +38,6 @@ class Options(ScanAndGrid, CorrectedImages, WritingOptions):
     poses: Annotated[
         Path | None,
         typer.Option("--poses", help="The scan's poses.csv: with --calibration its whole covariance is the prior."),
-    ] = None
-    checkpoint: Annotated[
-        Path | None,
-        typer.Option(
-            "--checkpoint",
-            help="Folder to keep the state in; a second run with the same images and settings continues from there.",
-        ),
     ] = None
     memory: Annotated[
         float | None, typer.Option("--memory-gib", help="Keep within this much memory: finer levels are left out.")
