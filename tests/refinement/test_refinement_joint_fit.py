@@ -117,12 +117,13 @@ def test_a_view_that_jumps_gets_a_prior_of_its_own():
     np.testing.assert_array_equal(wide.stated.blocks, prior.blocks)
 
 
-def test_a_view_with_a_prior_of_its_own_is_named_however_uncertain_its_depth_is():
-    prior = scatter(np.full(9, 0.1), np.full(9, 0.01))
-    q = 0.01 * np.random.default_rng(0).standard_normal((9, 6))
-    q[4, 0] = 2.0
-    assert jumps(q, np.ones((9, 6)), prior.with_jumps(q), 10.0) == (4,)
-    assert jumps(q, np.ones((9, 6)), prior, 10.0) == ()
+def test_a_view_is_a_jump_beyond_the_others_and_beyond_its_own_uncertainty():
+    moved = 0.01 * np.random.default_rng(0).standard_normal((30, 5, 2))
+    moved[4] = 0.5
+    assert jumps(moved, np.full((30, 5), 0.02)) == (4,)
+    assert jumps(moved, np.full((30, 5), 0.2)) == ()
+    moved[4] = 0.01
+    assert jumps(moved, np.full((30, 5), 0.001)) == ()
 
 
 def test_a_turn_that_no_image_shows_is_open_by_what_it_leaves_in_pixels():

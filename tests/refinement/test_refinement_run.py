@@ -51,6 +51,16 @@ def test_a_right_geometry_is_returned_as_it_was_and_the_reason_is_said():
 
 
 @pytest.mark.slow
+def test_a_view_that_jumps_is_named_and_brought_back():
+    images, matrices, truth = scan("jump")
+    result = tp.refine(images, matrices, GRID, images_are="transmission", settings=tp.RefineSettings(threads=1))
+    before, after = (objects.error_px(np.asarray(m), truth) for m in (matrices, result.matrices))
+    assert result.verdict == "refined"
+    assert result.outliers == (8,)
+    assert after < before / 2
+
+
+@pytest.mark.slow
 def test_the_command_writes_matrices_json_and_report_and_refuses_an_object_beyond_the_grid(tmp_path, capsys):
     images, matrices, _ = scan("white", "rod")
     tp.write_matrices(tmp_path / "m.npz", matrices)

@@ -26,7 +26,6 @@ from tomopose.refinement.joint_fit.measured import measured, rays_through
 from tomopose.refinement.joint_fit.motions import pixel_jacobian, transforms
 from tomopose.refinement.joint_fit.pyramid import level_of
 from tomopose.refinement.judge import Evidence, Verdict, decide, trial
-from tomopose.refinement.prior import Prior
 from tomopose.refinement.result import Refinement
 from tomopose.refinement.settings import OPEN_PX, RefineSettings
 from tomopose.refinement.stated import points_of, prior_of, radius_of
@@ -128,7 +127,8 @@ def assessed(
     widening = widening_of(errors, information, prior, K)
     spread = spread_of(widening, information if state.information is None else state.information, prior, K)
     steps.done()
-    moved = np.sqrt(np.mean(np.einsum("nmic,nc->nmi", K, state.q) ** 2) / np.mean(spread.points_sigma**2))
+    moved_px = np.einsum("nmic,nc->nmi", K, state.q)
+    moved = np.sqrt(np.mean(moved_px**2) / np.mean(spread.points_sigma**2))
     known_px = float(np.sqrt(np.mean(spread.points_known**2)))
     halves = halves_px(level, prior, replace(fit, steps=s.steps), K, known_px)
     verdict, reasons = decide(
@@ -165,7 +165,7 @@ def assessed(
         converged=state.settled,
         chi=state.chi,
         prior_sizes={name: float(size) for name, size in zip(prior.names, prior.sizes, strict=True)},
-        outliers=jumps(state.q, spread.sigma, prior, radius),
+        outliers=jumps(moved_px, spread.points_sigma) if verdict is Verdict.REFINED else (),
         widening=widening.factor,
         halves_px=halves,
         stated_px=float(np.sqrt(np.mean(spread.points_sigma**2))),
@@ -174,13 +174,14 @@ def assessed(
     )
 
 
-def jumps(q: Array, sigma: Array, prior: Prior, radius: float) -> tuple[int, ...]:
-    """Views whose correction is beyond six robust standard deviations of all and either beyond the scatter of the
-    others by the prior, or beyond four of its own uncertainty."""
-    lever = np.array([1.0] * 3 + [radius] * 3)
-    size = np.linalg.norm(q * lever, axis=1)
+def jumps(moved: Array, sigma: Array) -> tuple[int, ...]:
+    """Views that are beyond six robust standard deviations of all and four of their own uncertainty.
+
+    moved: (n, m, 2) px that the correction moves points; sigma: (n, m), px per coordinate, after it.  In pixels a
+    view's depth, which is uncertain and hardly seen, does not hide a jump.
+    """
+    size = np.sqrt(np.mean(moved**2, axis=(1, 2)))
     middle = float(np.median(size))
     wide = MAD_TO_SIGMA * float(np.median(np.abs(size - middle)))
-    own = np.linalg.norm(sigma * lever, axis=1)
-    apart = prior.widths.reshape(len(q), -1).max(axis=1) > 1
-    return tuple(int(j) for j in np.flatnonzero((size > middle + 6 * wide) & (apart | (size > 4 * own))))
+    own = np.sqrt(np.mean(sigma**2, axis=1))
+    return tuple(int(j) for j in np.flatnonzero((size > middle + 6 * wide) & (size > 4 * own)))
