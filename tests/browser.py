@@ -62,14 +62,16 @@ def review_address(*words: str) -> Iterator[str]:
         [sys.executable, "-m", "tomopose", "review", *words, "--no-browser"], stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"},
     )  # fmt: skip
-    line = process.stdout.readline()
-    found = ADDRESS.search(line)
-    assert found, (line, process.stderr.read() if process.poll() is not None else "")
-    yield found[0]
-    process.terminate()
-    process.wait(timeout=30)
-    process.stdout.close()
-    process.stderr.close()
+    try:
+        line = process.stdout.readline()
+        found = ADDRESS.search(line)
+        assert found, (line, "" if line else process.stderr.read())
+        yield found[0]
+    finally:
+        process.terminate()
+        process.wait(timeout=30)
+        process.stdout.close()
+        process.stderr.close()
 
 
 def open_page(browser, address: str, *, width: int = 1400, scheme: str = "light"):

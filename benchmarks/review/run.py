@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import os
 import re
 import shutil
@@ -27,12 +26,11 @@ import numpy as np
 from scipy.special import ndtr
 
 import tomopose as tp
-from tomopose.files import plain
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import eq5_matrices, project_ball
 from tomopose.geometry.silhouette import silhouette_ellipse
 from tomopose.report import calibration_report, matrices_report, observations_report
-from tomopose.review.app import Desk
+from tomopose.review.app import Desk, as_json
 from tomopose.review.session import Review, begin, decision_about
 
 BALL, DIAMETER, NOISE_PX, SIDE = np.array([3.0, -2.0, 21.0]), 8.0, 0.0146, 4096
@@ -60,7 +58,7 @@ def run_of(poses: tp.PoseSequence, *, n: int = 2048, spoilt: int = 0) -> tuple[t
     centre, a, b, angle = (np.array([e[k] for e in found]) for k in range(4))
     return scanner, tp.BallObservations.from_sigma(
         x, NOISE_PX, pose_id=poses.pose_id, image=tuple(f"{p}.tif" for p in poses.pose_id), x_ellipse=centre,
-        semi_major=a, semi_minor=b, angle=angle,
+        semi_major=a, semi_minor=b, angle=angle, ball_diameter=DIAMETER,
     )  # fmt: skip
 
 
@@ -113,7 +111,7 @@ def decided(desk: Desk, k: int) -> str:
     def changed(review: Review) -> Review:
         return review.with_decision(decision)
 
-    return json.dumps(plain(desk.take(changed)), allow_nan=False)
+    return bytes(as_json(desk.take(changed)).body).decode()
 
 
 def write_sparse(path: Path, centre: np.ndarray, radius: float, rng: np.random.Generator) -> None:

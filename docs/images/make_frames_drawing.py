@@ -128,7 +128,7 @@ def frames_drawing() -> str:
         f'<circle cx="{place(source)[0]:.1f}" cy="{place(source)[1]:.1f}" r="5" fill="#d9792b"/>',
         f'<circle cx="{place(ball)[0]:.1f}" cy="{place(ball)[1]:.1f}" r="9" fill="#6b7683" stroke="{INK}"/>',
         f'<circle cx="{place([-7.8, 0, 0])[0]:.1f}" cy="{place([-7.8, 0, 0])[1]:.1f}" r="3" fill="#b98a4e"/>',
-        text("ball, at t in M", ball, shift=(-4, -16), colour=SOFT, size=13),
+        text("ball, at t in M", ball, shift=(20, -10), colour=SOFT, size=13),
         f'<circle cx="{place(ray)[0]:.1f}" cy="{place(ray)[1]:.1f}" r="4" fill="#d9792b"/>',
         text("x<tspan dy='4' font-size='11'>D</tspan>", ray, shift=(10, 0), size=16),
         path([corner[0], corner[0] + 1.5 * (corner[1] - corner[0]) / 4.9], colour=AXES[0], width=2.4, arrow="head0"),
@@ -214,7 +214,7 @@ def detector_drawing() -> str:
                 f'<circle cx="{x0}" cy="{y0}" r="3.5" fill="{INK}"/>'
             )
             words(x0 + 2.1 * cell, y0 - 4, "u", AXES[0])
-            words(x0 + 11, y0 - 1.85 * cell, "v", AXES[1])
+            words(x0 - 17, y0 - 1.85 * cell, "v", AXES[1])
             words(left + n_u * cell / 2, bottom + 26, "numbers are u, v; (0, 0) is the centre of a pixel", SOFT, 13)
     return svg(parts, "Pixel coordinates of the frame D beside the rows of an image file", width=870, height=275)
 

@@ -31,9 +31,9 @@ def main() -> None:
     FOLDER.mkdir(exist_ok=True)
     bad = 0
     for name in sys.argv[1:] or KEPT:
+        figures = run_study(name).figures  # before anything is removed: a run that ends early loses no picture
         for old in FOLDER.glob(f"{name}-*.png"):
             old.unlink()
-        figures = run_study(name).figures
         for k in KEPT[name]:
             hidden = figure_png(FOLDER / f"{name}-{k}.png", figures[k - 1])
             print(FOLDER / f"{name}-{k}.png", figures[k - 1].title, *hidden, sep="; ", flush=True)

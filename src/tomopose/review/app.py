@@ -153,7 +153,11 @@ def as_json(content: Mapping[str, object], status: int = 200) -> Response:
     """An answer of JSON; numbers that are not finite become null."""
     from starlette.responses import Response
 
-    return Response(json.dumps(plain(content), allow_nan=False), status, media_type="application/json")
+    try:
+        text = json.dumps(content, allow_nan=False, default=plain)
+    except ValueError:  # a number that is not finite somewhere: looked for in all of it
+        text = json.dumps(plain(content), allow_nan=False)
+    return Response(text, status, media_type="application/json")
 
 
 def as_text(words: str, status: int) -> Response:

@@ -10,6 +10,8 @@ from tomopose.review.app import INSTALL
 from tomopose.review.guard import Guard
 
 ADDRESS = "127.0.0.1"
+PATIENCE = 3
+"""Seconds that an answer under way may still take when the review is ended."""
 
 
 def loopback_socket(port: int) -> socket.socket:
@@ -39,6 +41,13 @@ def serve(app: Guard, listening: socket.socket, *, ready: Callable[[], object] =
     except ImportError as error:
         raise EngineMissingError("a review needs starlette and uvicorn", install_line=INSTALL) from error
 
-    config = uvicorn.Config(app, log_level="warning", access_log=False, server_header=False, date_header=False)
+    config = uvicorn.Config(
+        app,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        date_header=False,
+        timeout_graceful_shutdown=PATIENCE,
+    )
     ready()
     uvicorn.Server(config).run(sockets=[listening])

@@ -13,7 +13,6 @@ from tomopose.calibration.records.decisions import Decision
 from tomopose.calibration.result import Calibration
 from tomopose.observations import BallObservations
 from tomopose.report.figures import coverage_figures, residual_figures, scene_figures
-from tomopose.report.figures.thumbnails import ellipse_outline
 from tomopose.report.gather import join
 from tomopose.report.page import Figure, figure_content
 from tomopose.report.words import meaning, small_unit
@@ -84,7 +83,7 @@ def _outline(o: BallObservations, k: int) -> list[float] | None:
         return None
     angle = 0.0 if o.angle is None or not np.isfinite(o.angle[k]) else float(o.angle[k])
     values = [*map(float, o.x_ellipse[k]), float(o.semi_major[k]), float(o.semi_minor[k]), angle]
-    return values if np.isfinite(ellipse_outline(values[:2], *values[2:])).all() else None
+    return values if all(map(math.isfinite, values)) else None
 
 
 def result_view(calibration: Calibration) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.rigid.estimate import LIKELY
-from tomopose.calibration.rigid.fit import Fit
+from tomopose.calibration.rigid.fit import Fit, balls_in_table
 from tomopose.errors import InputError
 from tomopose.units import Array
 
@@ -58,11 +58,7 @@ def beams(problem: Problem) -> Array:
 
 def depths(problem: Problem, fit: Fit, beam: Array | None = None) -> Array:
     """(n,) mm: distance of the ball from the focal spot along the beam, in every pose; beam: of `beams`, if known."""
-    if len(fit.t) == 1:
-        x_H = (problem.R_MH.reshape(-1, 3) @ fit.t[0]).reshape(-1, 3) + problem.t_MH
-    else:
-        x_H = (problem.R_MH @ fit.t[problem.ball][:, :, None])[..., 0] + problem.t_MH
-    x_T = x_H @ fit.R_HT.T + fit.t_HT
+    x_T = balls_in_table(problem, fit)
     beam = beams(problem) if beam is None else beam
     return np.asarray((beam[:, :3] * x_T).sum(axis=1) + beam[:, 3])
 

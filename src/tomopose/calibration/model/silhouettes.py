@@ -16,8 +16,9 @@ def chain_matrices(problem: Problem, scanners: tuple[Scanner, ...], T_HT: RigidT
     T_MH[:, :3, :3], T_MH[:, :3, 3], T_MH[:, 3, 3] = problem.R_MH, problem.t_MH, 1.0
     P = np.empty((len(problem), 3, 4))
     for r, scanner in enumerate(scanners):
-        mine = problem.run == r
-        P[mine] = scanner.P_S @ scanner.T_WS.matrix @ scanner.T_TW(problem.alpha[mine]).matrix
+        mine = slice(None) if len(scanners) == 1 else problem.run == r
+        alpha, which = np.unique(problem.alpha[mine], return_inverse=True)
+        P[mine] = (scanner.P_S @ scanner.T_WS.matrix @ scanner.T_TW(alpha).matrix)[which.reshape(-1)]
     return P @ T_HT.matrix @ T_MH
 
 
@@ -27,13 +28,13 @@ def silhouette_outlines(P: Array, centres: Array, diameter: float) -> Array:
     The dual quadric of a sphere, x x^T - r^2 diag(1, 1, 1, 0), has the dual conic P Q P^T as its outline (Hartley and
     Zisserman, Multiple View Geometry, sec. 8.3), which gives the ellipse's centre and shape.
     """
-    x = np.concatenate([centres, np.ones((len(centres), 1))], axis=1)
-    Q = x[:, :, None] * x[:, None, :]
-    Q[:, range(3), range(3)] -= (diameter / 2.0) ** 2
-    C = P @ Q @ np.swapaxes(P, 1, 2)
+    M = P[:, :, :3]
+    y = (M @ centres[:, :, None])[..., 0] + P[:, :, 3]
+    C = y[:, :, None] * y[:, None, :] - (diameter / 2.0) ** 2 * (M @ np.swapaxes(M, 1, 2))
     C = C / C[:, 2:, 2:]
     m = C[:, :2, 2]
-    outline: Array = np.sqrt(np.maximum(np.linalg.det(m[:, :, None] * m[:, None, :] - C[:, :2, :2]), 0.0))
+    S = m[:, :, None] * m[:, None, :] - C[:, :2, :2]
+    outline: Array = np.sqrt(np.maximum(S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] * S[:, 1, 0], 0.0))
     return outline
 
 

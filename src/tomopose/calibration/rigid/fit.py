@@ -99,6 +99,15 @@ def residuals(problem: Problem, free: FreeParameters, fit: Fit) -> Array:
     return problem.x_D - x
 
 
+def balls_in_table(problem: Problem, fit: Fit) -> Array:
+    """(n, 3) mm: where a fit places the ball of each row in T, the poses as reported."""
+    if len(fit.t) == 1:
+        x_H = (problem.R_MH.reshape(-1, 3) @ fit.t[0]).reshape(-1, 3) + problem.t_MH
+    else:
+        x_H = (problem.R_MH @ fit.t[problem.ball][:, :, None])[..., 0] + problem.t_MH
+    return np.asarray(x_H @ fit.R_HT.T + fit.t_HT)
+
+
 def whitened2(problem: Problem, r: Array) -> Array:
     """(n,) squared length of residuals r (n, 2) px in standard deviations of the centres."""
     W = problem.W

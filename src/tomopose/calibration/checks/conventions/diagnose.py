@@ -56,6 +56,7 @@ class _Declared:
     fit: Fit
     placed: Placement
     beam: Array
+    cameras: Cameras
 
     @functools.cached_property
     def n_prior(self) -> int:
@@ -95,7 +96,7 @@ class _Declared:
             d_SR=self.placed.d_SR,
             possible=self.placed.possible,
             share=left.share,
-            size_ratio=size_ratio(self.problem, self.free, self.fit),
+            size_ratio=size_ratio(self.problem, self.free, self.fit, self.cameras),
         )
 
 
@@ -116,7 +117,9 @@ def ranked(
     cameras = Cameras.of(problem)
     rays = ray_equations(problem, cameras)
     beam = beams(problem)
-    declared = _Declared(problem=problem, free=free, fit=fit, placed=placement(problem, fit, beam), beam=beam)
+    declared = _Declared(
+        problem=problem, free=free, fit=fit, placed=placement(problem, fit, beam), beam=beam, cameras=cameras
+    )
     hopeless = HOPELESS * max(fit.chi2, float(declared.own.dof))
     tried: list[tuple[Alternative, Reading]] = []
     for alternative in alternatives:
@@ -190,7 +193,7 @@ def _judged(
             d_SR=placed.d_SR,
             possible=placed.possible,
             share=left.share,
-            size_ratio=size_ratio(changed, declared.free, fit),
+            size_ratio=size_ratio(changed, declared.free, fit, declared.cameras if same else None),
         ),
     )
     likelier = better_placed(placed, declared.placed) and not changed.units_confirmed

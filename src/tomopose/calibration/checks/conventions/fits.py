@@ -19,9 +19,9 @@ from tomopose.calibration.model.parameters import (
     free_parameters,
 )
 from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.model.silhouettes import chain_matrices, size_ratio_of
-from tomopose.calibration.rigid.fit import Fit, minimise, residuals, whitened2
-from tomopose.calibration.rigid.start import Rays, closed_forms, other_starts, ray_equations, turned_about_beam
+from tomopose.calibration.model.silhouettes import size_ratio_of
+from tomopose.calibration.rigid.fit import Fit, balls_in_table, minimise, residuals, whitened2
+from tomopose.calibration.rigid.start import Cameras, Rays, closed_forms, other_starts, ray_equations, turned_about_beam
 from tomopose.units import Array
 
 ITERATIONS = 20
@@ -61,15 +61,20 @@ class Left:
         )
 
 
-def size_ratio(problem: Problem, free: FreeParameters, fit: Fit) -> float:
-    """Measured size of the silhouettes over the calculated one; NaN where it is not known or cannot be calculated."""
+def size_ratio(problem: Problem, free: FreeParameters, fit: Fit, cameras: Cameras | None = None) -> float:
+    """Measured size of the silhouettes over the calculated one; NaN where it is not known or cannot be calculated.
+
+    cameras: of the problem with the scanners' values as they are, where known.
+    """
     if problem.outline is None or problem.ball_diameter is None or not np.isfinite(fit.chi2):
         return float("nan")
-    try:
-        scanners = adjusted_scanners(problem.scanners, free, fit.delta)
-    except ImpossibleScannerError:  # a wrong reading may end anywhere
-        return float("nan")
-    found = size_ratio_of(problem, chain_matrices(problem, scanners, fit.T_HT), fit.t[problem.ball])
+    if cameras is None or fit.delta.any():
+        try:
+            scanners = adjusted_scanners(problem.scanners, free, fit.delta)
+        except ImpossibleScannerError:  # a wrong reading may end anywhere
+            return float("nan")
+        cameras = Cameras.of(replace(problem, scanners=scanners))
+    found = size_ratio_of(problem, cameras.P, balls_in_table(problem, fit))
     return float("nan") if found is None else found
 
 
