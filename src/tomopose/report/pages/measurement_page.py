@@ -130,18 +130,32 @@ def _keys(results: MeasurementResults) -> list[KeyFigure]:
     )
     spacing = max(results.spacing_mm.values(), default=math.nan)
     keys = [
-        KeyFigure(name="Results", value=str(len(results)), note=f"of {len(results.volumes)} volume(s)"),
-        KeyFigure(name="Voxel", value=f"{number(spacing)} mm"),
+        KeyFigure(
+            name="Results", value=str(len(results)), note=f"Measured values of {len(results.volumes)} volume(s)."
+        ),
+        KeyFigure(name="Voxel", value=f"{number(spacing)} mm", note="Largest side; errors of edges scale with it."),
     ]
     if errors.size:
         largest = float(np.abs(errors).max())
         keys += [
-            KeyFigure(name="Largest length error", value=f"{_um(largest)} µm", note=f"{largest / spacing:.3f} voxel"),
-            KeyFigure(name="Rms of length errors", value=f"{_um(float(np.sqrt(np.mean(errors**2))))} µm"),
+            KeyFigure(
+                name="Largest length error",
+                value=f"{_um(largest)} µm",
+                note=f"{largest / spacing:.3f} of a voxel; compare it with what is permitted.",
+            ),
+            KeyFigure(
+                name="Rms of length errors",
+                value=f"{_um(float(np.sqrt(np.mean(errors**2))))} µm",
+                note="Of all distances, diameters and positions: the usual error.",
+            ),
         ]
     for name, factor in results.scale.items():
         if factor != 1.0:
-            keys.append(KeyFigure(name="Scale correction", value=f"{factor:.7f}", note=name))
+            keys.append(
+                KeyFigure(
+                    name="Scale correction", value=f"{factor:.7f}", note=f"Lengths of {name} were multiplied by it."
+                )
+            )
     return keys
 
 

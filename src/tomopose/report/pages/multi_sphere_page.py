@@ -37,9 +37,21 @@ def multi_sphere_report(result: MultiSphereCalibration, *, title: str = "Multi-s
                 reasons=[f"{f.words}: {f.remedy}" if f.remedy else f.words for f in result.checks],
             ),
             key_figures=[
-                KeyFigure(name="d_rms", value=f"{number(result.d_rms)} px", note="all balls of all views"),
-                KeyFigure(name="chi2/dof", value=number(result.chi2_dof), note="1: as the uncertainties say"),
-                KeyFigure(name="Balls a view", value=f"{result.balls_used.min()} to {result.balls_used.max()}"),
+                KeyFigure(
+                    name="d_rms",
+                    value=f"{number(result.d_rms)} px",
+                    note="All balls of all views: what the path leaves.",
+                ),
+                KeyFigure(
+                    name="chi2/dof",
+                    value=number(result.chi2_dof),
+                    note="1: as the uncertainties say; far above it something is not modelled.",
+                ),
+                KeyFigure(
+                    name="Balls a view",
+                    value=f"{result.balls_used.min()} to {result.balls_used.max()}",
+                    note="Three determine a pose; more show a wrong one.",
+                ),
                 KeyFigure(
                     name="Uncertainty of a view",
                     value=f"{number(np.sqrt(np.mean(np.square(np.asarray(matrices.points_sigma)))))} px",

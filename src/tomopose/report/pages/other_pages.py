@@ -105,13 +105,21 @@ def _detection_keys(observations: BallObservations) -> list[KeyFigure]:
     snr = None if observations.snr is None else observations.snr[observations.seen]
     middle = NOT_GIVEN if snr is None or not np.isfinite(snr).any() else number(np.nanmedian(snr))
     return [
-        KeyFigure(name="Images with a ball", value=f"{int(observations.seen.sum())} of {len(observations)}"),
+        KeyFigure(
+            name="Images with a ball",
+            value=f"{int(observations.seen.sum())} of {len(observations)}",
+            note="The others are listed below, each with its reason.",
+        ),
         KeyFigure(
             name="Standard uncertainty",
-            note="median of u and v",
+            note="Median of u and v, as the detection predicts it; 0.05 px and less is good.",
             value=f"{number(np.median(sigma))} px" if sigma.size else NOT_DETERMINABLE,
         ),
-        KeyFigure(name="SNR", value=middle, note="median"),
+        KeyFigure(
+            name="SNR",
+            value=middle,
+            note="Median of the ball's contrast over the noise; the higher, the smaller the uncertainty.",
+        ),
     ]
 
 
@@ -260,16 +268,21 @@ def matrices_report(
             subtitle=f"{len(matrices)} views, detector {matrices.n_u} × {matrices.n_v} pixels of {matrices.p_u:g} × "
             f"{matrices.p_v:g} mm",
             key_figures=[
-                KeyFigure(name="Views", value=str(len(matrices))),
-                KeyFigure(name="d_SD", value=f"{np.median(view.d_SD):.3f} mm", note="median"),
+                KeyFigure(name="Views", value=str(len(matrices)), note="One matrix each."),
+                KeyFigure(
+                    name="d_SD",
+                    value=f"{np.median(view.d_SD):.3f} mm",
+                    note="Source to detector, median; the same in every view of a usual scan.",
+                ),
                 KeyFigure(
                     name="Source to object",
                     value=f"{np.median(np.linalg.norm(view.source, axis=1)):.3f} mm",
-                    note="median",
+                    note="To the origin of W, median: with d_SD it gives the magnification.",
                 ),
                 KeyFigure(
                     name="Height of the source",
                     value=f"{view.source[:, 2].min():.1f} … {view.source[:, 2].max():.1f} mm",
+                    note="Along z of W; a circular scan keeps one height, a 3D scan does not.",
                 ),
             ],
             sections=[Section(title="The scan", blocks=blocks), provenance_section(provenance)],

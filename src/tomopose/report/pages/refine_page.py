@@ -49,15 +49,15 @@ def refinement_report(views: RefinedViews, *, title: str = "Refinement report") 
             title=title,
             subtitle=f"{len(c['residual_before'])} views",
             key_figures=[
-                KeyFigure(name="Correction", value=views.verdict),
-                KeyFigure(name="Gain of held-out pixels", note="standard errors", value=f"{views.gain:.1f}"),
                 KeyFigure(
                     name="Uncertainty of a view",
                     note="px a coordinate: stated, and by two halves of the views refined apart",
                     value=f"{views.stated_px:.3g}, {views.halves_px:.3g}",
                 ),
                 KeyFigure(
-                    name="Residual of a view", note="median, before and after", value=f"{before:.3g}, {after:.3g}"
+                    name="Residual of a view",
+                    note="Median, before and after; the second should be smaller.",
+                    value=f"{before:.3g}, {after:.3g}",
                 ),
             ],
             sections=[

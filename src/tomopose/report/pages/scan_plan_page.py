@@ -117,10 +117,24 @@ def scan_plan_report(
             subtitle=f"{document['views']} views of {document['part']}, chosen of {document['candidates']} candidates",
             verdict=verdict,
             key_figures=[
-                KeyFigure(name="Coverage C", value=f"{document['C']:.3f}", note="share of points that a ray grazes"),
-                KeyFigure(name="Completeness T", value=f"{document['T']:.3f}", note="planes crossed by the source"),
-                KeyFigure(name="Transmission M", value=f"{document['M']:.3f}", note="mean over views and points"),
-                KeyFigure(name="Travel", value=f"{document['travel']:.0f}", note="mm and degrees, all axes"),
+                KeyFigure(
+                    name="Coverage C", value=f"{document['C']:.3f}", note="Share of the points that a ray grazes."
+                ),
+                KeyFigure(
+                    name="Completeness T",
+                    value=f"{document['T']:.3f}",
+                    note="Share of the planes through the part that the source crosses.",
+                ),
+                KeyFigure(
+                    name="Transmission M",
+                    value=f"{document['M']:.3f}",
+                    note="Mean over views and points; dark views are noise.",
+                ),
+                KeyFigure(
+                    name="Travel",
+                    value=f"{document['travel']:.0f}",
+                    note="In mm and degrees, all axes: the machine's time.",
+                ),
             ],
             sections=[
                 Section(

@@ -82,7 +82,9 @@ def study_report(
                 tone=GOOD if held == len(checks) else BAD,
                 reasons=[f"{c['statement']}: {c['found']}" for c in checks if not c["holds"]],
             ),
-            key_figures=[KeyFigure(name="Time of this run", value=f"{seconds:.0f} s", note=f"scale {scale}")],
+            key_figures=[
+                KeyFigure(name="Time of this run", value=f"{seconds:.0f} s", note=f"Scale {scale}, on this machine.")
+            ],
             sections=[s for s in sections if s.blocks],
             footer="Written by tomopose.",
         )

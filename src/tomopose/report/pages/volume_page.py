@@ -56,11 +56,17 @@ def volume_report(volume: Volume, *, title: str = "Reconstruction report") -> st
             title=title,
             subtitle=f"{n_x} × {n_y} × {n_z} voxels of {' × '.join(f'{s:g}' for s in volume.grid.spacing)} mm, frame W",
             key_figures=[
-                KeyFigure(name="Voxels", value=f"{n_x * n_y * n_z / 1e6:.1f} million"),
-                KeyFigure(name="Largest value", value=f"{float(volume.values.max()):.4g} / mm"),
+                KeyFigure(
+                    name="Voxels", value=f"{n_x * n_y * n_z / 1e6:.1f} million", note="Of the whole grid, air included."
+                ),
+                KeyFigure(
+                    name="Largest value",
+                    value=f"{float(volume.values.max()):.4g} / mm",
+                    note="Attenuation: compare it with the material's; far above it lie streaks.",
+                ),
                 KeyFigure(
                     name="Residual of a view",
-                    note="median of the reprojection",
+                    note="Median of the reprojection; one view far above the others has a wrong matrix.",
                     value="not determinable" if residual is None else f"{float(np.median(residual)):.3g}",
                 ),
             ],
