@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -43,6 +44,13 @@ def hidden(browser, svg: str) -> list[str]:
         if p < w - TOUCHING or q < x - TOUCHING or r > y + TOUCHING or s > z + TOUCHING:
             found.append(f"{a['words']!r} leaves the sheet")
     return found
+
+
+def test_every_picture_that_a_page_shows_is_there():
+    docs = DRAWINGS[0].parents[1]
+    for page in docs.rglob("*.md"):
+        for name in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
+            assert (page.parent / name).is_file(), (page.name, name)
 
 
 @pytest.mark.parametrize("drawing", DRAWINGS, ids=lambda p: p.stem)
