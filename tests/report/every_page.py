@@ -115,7 +115,7 @@ def refinement() -> str:
     return refinement_report(
         RefinedViews(
             columns=columns, verdict="applied", reasons=("held-out pixels fit better",), unobservable=("a shift",),
-            gain=12.0, before=volume(), after=volume(), provenance=None,
+            gain=12.0, halves_px=0.02, stated_px=0.03, before=volume(), after=volume(), provenance=None,
         )
     )  # fmt: skip
 
