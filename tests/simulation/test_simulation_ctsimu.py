@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 
 from tomopose import PoseSequence, RigidTransform, Scanner
 from tomopose.errors import FileError, InputError
@@ -15,7 +16,7 @@ from tomopose.simulation.objects.mesh import write_stl
 from tomopose.simulation.objects.shapes import Solid, box, cylinder
 from tomopose.simulation.projector.focal_spot import FocalSpot
 from tomopose.simulation.run import ball_spectrum, render, simulate_ball_run, transmission
-from tomopose.simulation.scene.ctsimu import run_from_ctsimu
+from tomopose.simulation.scene.ctsimu import blur_of, resolution_of, run_from_ctsimu
 from tomopose.simulation.scene.ctsimu_writing import run_to_ctsimu
 
 pytest.importorskip("embreex")
@@ -33,6 +34,19 @@ def run():
         scanner, T_HT=mount, t=np.zeros(3), poses=poses, solids=solids, spectrum=ball_spectrum(copper=0.3)
     )
     return replace(made, t=None, ball_diameter=None, spot=FocalSpot(shape="gaussian", size_u=0.05, size_v=0.05))
+
+
+@pytest.mark.parametrize("resolution", [1.5, 3.0, 6.0])
+@pytest.mark.parametrize("opacity", [0.3, 1.0, 3.0])
+def test_a_basic_spatial_resolution_dims_the_gap_of_its_own_wire_pair_by_20_percent(resolution, opacity):
+    """Two round wires and a gap of that width, px, blurred and seen through square pixels, against ASTM E2002."""
+    h = 0.01
+    x = np.arange(-30, 30 + h / 2, h)
+    chords = sum(2 * np.sqrt(np.clip(resolution**2 / 4 - (x - c) ** 2, 0, None)) for c in (-resolution, resolution))
+    absorbed = 1 - np.exp(-opacity / resolution * chords)
+    seen = uniform_filter1d(gaussian_filter1d(absorbed, blur_of(resolution) / h), round(1 / h))
+    assert 1 - seen[len(x) // 2] / seen.max() == pytest.approx(0.2, abs=0.012)
+    assert resolution_of(blur_of(resolution)) == pytest.approx(resolution)
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from tomopose.simulation.physics.materials import Material, from_formula
 from tomopose.simulation.physics.spectrum import Spectrum
 from tomopose.simulation.projector.focal_spot import FWHM_PER_SIGMA
 from tomopose.simulation.run import SimulatedRun
-from tomopose.simulation.scene.ctsimu import SIGMA_PER_RESOLUTION, STAGE_TO_M
+from tomopose.simulation.scene.ctsimu import STAGE_TO_M, resolution_of
 from tomopose.values import require_types
 
 ANODE_DENSITY = 10.0
@@ -86,7 +86,7 @@ def run_to_ctsimu(run: SimulatedRun) -> tuple[dict[str, object], dict[str, Trian
         "gray_value": {"imin": {"value": d.dark}, "imax": {"value": d.dark + d.white}},
         "noise": {"snr_at_imax": {"value": None if math.isinf(d.snr) else d.snr}},
         "unsharpness": {
-            "basic_spatial_resolution": {"value": d.blur_sigma * run.scanner.p_u / SIGMA_PER_RESOLUTION, "unit": "mm"}
+            "basic_spatial_resolution": {"value": run.scanner.p_u * resolution_of(d.blur_sigma), "unit": "mm"}
         },
     }
     return content, files
