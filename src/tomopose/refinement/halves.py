@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 import scipy.linalg
 
 from tomopose.refinement.joint_fit.fit import Fit, State, blank, linearised
@@ -44,7 +45,7 @@ def differences(data: Measured, prior: Prior, fit: Fit, K: Array) -> float:
         return float("nan")
     rows = [np.arange(start, n, 2) for start in (0, 1)]
     parts = [views_of(data, half) for half in rows]
-    precisions = [np.linalg.inv(prior.of_views(half).covariance) for half in rows]
+    precisions = [prior.of_views(half).precision for half in rows]
     found = [
         replace(fit, precision=precision)(part, blank(part)) for part, precision in zip(parts, precisions, strict=True)
     ]
@@ -57,7 +58,7 @@ def differences(data: Measured, prior: Prior, fit: Fit, K: Array) -> float:
     return squares / count
 
 
-def views_of(data: Measured, rows: Array) -> Measured:
+def views_of(data: Measured, rows: npt.NDArray[np.int_]) -> Measured:
     """The data of some views."""
     return replace(
         data, p=data.p[rows], weight=data.weight[rows], judge=data.judge[rows], matrices=data.matrices.select(rows)

@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from tomopose.units import Array
 
@@ -66,7 +67,7 @@ class Prior:
         """Rms standard uncertainty, px per coordinate, where K (n, m, 2, 6) is px per motion."""
         return float(np.sqrt(np.mean(np.einsum("nmic,ncd,nmid->nmi", K, self.blocks, K))))
 
-    def of_views(self, rows: Array) -> Prior:
+    def of_views(self, rows: npt.NDArray[np.int_]) -> Prior:
         """The prior of some views alone."""
         at = (6 * np.asarray(rows)[:, None] + np.arange(6)).ravel()
         return replace(self, parts=tuple(K[np.ix_(at, at)] for K in self.parts), widths=self.widths[at])

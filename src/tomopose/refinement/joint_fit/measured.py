@@ -4,6 +4,7 @@ meet what lies beyond the grid."""
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,7 +66,7 @@ class Measured:
             delta = np.zeros(2 * int(4 * sigma + 1) + 1)
             delta[len(delta) // 2] = 1.0
             left *= float(np.sum(scipy.ndimage.gaussian_filter1d(delta, sigma) ** 2)) if sigma else 1.0
-        return left**0.5
+        return math.sqrt(left)
 
 
 def measured(scan: LineIntegrals, grid: VoxelGrid, *, held_out: float, seed: int) -> Measured:
