@@ -66,7 +66,8 @@ def rotation_from_angles(angles: Array) -> Array:
 def rotation_about_axes(axes: str, angles: Array) -> Array:
     """Rotations (n, 3, 3) of angles (n, 3), rad, about three axes in a row: capitals moved, small ones fixed."""
     first, second, third = (ABOUT[a](angles[:, k]) for k, a in enumerate(axes.upper()))
-    return first @ second @ third if axes.isupper() else third @ second @ first
+    R: Array = first @ second @ third if axes.isupper() else third @ second @ first
+    return R
 
 
 def angles_from_rotation(R: Array) -> Array:

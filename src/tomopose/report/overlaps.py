@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -28,7 +28,8 @@ def overlaps(fig: Figure) -> tuple[str, ...]:
     for words, corners in boxes:
         if (corners < -TOUCHING).any() or (corners > [width + TOUCHING, height + TOUCHING]).any():
             found.append(f"{words!r} leaves the sheet")
-    for legend in [*fig.legends, *(a.get_legend() for a in fig.axes if a.get_legend() is not None)]:
+    own = (ax.get_legend() for ax in fig.axes)
+    for legend in [*fig.legends, *(one for one in own if one is not None)]:
         for ax in fig.axes:
             if _meet(_rectangle(legend.get_window_extent().extents), _rectangle(ax.get_window_extent().extents)):
                 found.append(f"the legend covers the axes {ax.get_title()!r}")
@@ -62,7 +63,7 @@ def _hidden(ax: Axes) -> Iterator[Text]:
                 yield from (tick.label1, tick.label2)
 
 
-def _rectangle(extents: Array) -> Array:
+def _rectangle(extents: Sequence[float] | Array) -> Array:
     """(4, 2) corners of (x0, y0, x1, y1)."""
     x0, y0, x1, y1 = extents
     return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])

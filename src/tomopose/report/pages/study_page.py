@@ -125,6 +125,8 @@ def _pyplot() -> Any:
     return plt
 
 
+LEGEND_LETTERS = 110
+"""Letters of a legend's line under a drawing."""
 LEVEL_LETTERS = 90
 """Letters that fit under a drawing side by side; longer rows of names are slanted."""
 
@@ -262,7 +264,10 @@ def figure_png(path: str | Path, figure: Figure) -> tuple[str, ...]:
         ax.set_title(figure.title)
         handles, labels = ax.get_legend_handles_labels()
         if labels:  # beside the axes: inside it would hide what is drawn
-            fig.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 4), fontsize=8)
+            side_by_side = LEGEND_LETTERS // (max(map(len, labels)) + 6)  # 6: the sample of the line
+            fig.legend(
+                handles, labels, loc="outside lower center", ncols=min(len(labels), 4, max(side_by_side, 1)), fontsize=8
+            )
         with atomic_file(path) as temporary:
             fig.savefig(temporary, dpi=DPI, format="png", bbox_inches="tight" if equal else None)
         return overlaps(fig)
