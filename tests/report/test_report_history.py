@@ -2,30 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 
 import numpy as np
 import pytest
+from every_page import shifted
 
-from tomopose import RigidTransform
 from tomopose.calibration.records.compare import compare
 from tomopose.calibration.records.history import history_entry
 from tomopose.errors import InputError
-from tomopose.geometry.frames import Frame
 from tomopose.report import calibration_report, comparison_report, history_report
 from tomopose.report.pages.history_page import signed
-
-
-def shifted(calibration, t):
-    """The same calibration with its mount moved by t, mm."""
-    T = RigidTransform(R=calibration.T_HT.R, t=calibration.T_HT.t + t, source=Frame.H, target=Frame.T)
-    moved = [
-        dataclasses.replace(p, value=p.value + t["xyz".index(p.name[-1])]) if p.name.startswith("t_HT") else p
-        for p in calibration.parameters
-    ]
-    return dataclasses.replace(calibration, T_HT=T, parameters=tuple(moved))
 
 
 @pytest.fixture(scope="module")

@@ -94,9 +94,9 @@ def minimise(
 def residuals(problem: Problem, free: FreeParameters, fit: Fit) -> Array:
     """(n, 2) px: observed minus calculated centres; NaN where a ball would be behind the source."""
     at = Point(np.ascontiguousarray(fit.R_HT), fit.t_HT, fit.t, fit.delta)
-    x = np.full((len(problem), 2), np.nan)
+    x: Array = np.full((len(problem), 2), np.nan)
     centres(rows_of(problem), freed_of(problem, free), at, x)
-    return problem.x_D - x
+    return np.asarray(problem.x_D - x)
 
 
 def balls_in_table(problem: Problem, fit: Fit) -> Array:

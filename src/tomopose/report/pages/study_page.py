@@ -203,7 +203,7 @@ def _draw(ax: Axes, trace: Mapping[str, Any], k: int, n: int) -> None:
         )
         words = [str(t) for t in trace["x"]]
         slanted = max(map(len, words), default=0) * len(words) > LEVEL_LETTERS
-        ax.set_xticks(list(x), words, **({"rotation": 20, "ha": "right"} if slanted else {}))
+        ax.set_xticks(list(x), words, rotation=20 if slanted else 0, ha="right" if slanted else "center")
     elif kind == "heatmap":
         values = np.array([[np.nan if v is None else v for v in line] for line in trace["z"]], dtype=np.float64)
         picture = ax.pcolormesh(
