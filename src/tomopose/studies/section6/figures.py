@@ -18,6 +18,8 @@ from tomopose.studies.section6.standard import true_distances
 from tomopose.studies.section6.tables import Found, deviations, limit
 from tomopose.units import Array
 
+GREY_STEPS = 250.0
+"""Steps of a slice's grey values: a screen shows 256."""
 RANGE_UM = 50.0
 """Where the colours of deviations are clipped; the paper clips at 25 um, at voxels of 0.0756 mm."""
 GREYS = [[0.0, "#000000"], [1.0, "#ffffff"]]
@@ -50,12 +52,13 @@ def slices(found: Found) -> Figure:
         values, side = np.array(found[case]["slice"]), float(found[case]["slice_side_mm"])
         n_z, n_x = values.shape
         middle = float(np.percentile(values, 99.5))
+        digits = int(np.ceil(-np.log10(max(middle, 1e-6) / GREY_STEPS)))
         data.append(
             {
                 "type": "heatmap",
                 "x": offset + side * np.arange(n_x),
                 "y": side * np.arange(n_z),
-                "z": values,
+                "z": np.round(values, digits),
                 "zmin": -0.15 * middle,
                 "zmax": 1.15 * middle,
                 "colorscale": GREYS,
