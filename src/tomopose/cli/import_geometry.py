@@ -34,8 +34,8 @@ class Options(WritingOptions):
         str | None,
         typer.Option(
             "--format",
-            help="Where the file does not say: rtk, astra, cera, openct, ctsimu, leap, tigre, cil, pyronn, "
-            "matrices, thd, rx.",
+            help="Format of the file, where it does not say: rtk, astra, cera, openct, ctsimu, leap, tigre, cil, "
+            "pyronn, matrices, thd, rx.",
         ),
     ] = None
     n_u: Annotated[int | None, typer.Option("--n-u-px", help="Detector width, px.")] = None

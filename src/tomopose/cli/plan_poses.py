@@ -75,7 +75,9 @@ class Options(WritingOptions):
     scanner: Annotated[
         Path | None, typer.Option("--scanner", help="scanner.json; refuses poses that put the ball out of view.")
     ] = None
-    ball_diameter: Annotated[float, typer.Option("--ball-diameter-mm", help="For the field of view, mm.")] = 8.0
+    ball_diameter: Annotated[
+        float, typer.Option("--ball-diameter-mm", help="Diameter of the ball, mm, which has to stay in view.")
+    ] = 8.0
     commands: Annotated[
         str | None,
         typer.Option("--commands", help="Also write the machine's own list: pi-gcs, kuka-krl, abb-rapid or ur-script."),

@@ -44,13 +44,17 @@ class ShapeOptions:
     shape: Annotated[
         str | None, typer.Option("--shape", help="circular, triangle (eq. 11) or sine (paper sec. 6.1).")
     ] = None
-    amplitude: Annotated[float | None, typer.Option("--amplitude-deg", help="Of the tilt; paper: 8 and 4.")] = None
-    periods: Annotated[int, typer.Option("--periods", min=1, help="Of the tilt in one turn.")] = 7
-    offset: Annotated[float | None, typer.Option("--offset-deg", help="Of the sine; paper: 1.")] = None
+    amplitude: Annotated[
+        float | None, typer.Option("--amplitude-deg", help="Amplitude of the tilt; paper: 8 and 4.")
+    ] = None
+    periods: Annotated[int, typer.Option("--periods", min=1, help="Periods of the tilt in one turn.")] = 7
+    offset: Annotated[float | None, typer.Option("--offset-deg", help="Offset of the sine; paper: 1.")] = None
     object_radius: Annotated[
         float | None, typer.Option("--object-radius-mm", help="Upright cylinder that must stay in view (with height).")
     ] = None
-    object_height: Annotated[float | None, typer.Option("--object-height-mm", help="Its height, centred.")] = None
+    object_height: Annotated[
+        float | None, typer.Option("--object-height-mm", help="Height of that cylinder, centred.")
+    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,9 +66,9 @@ class PartOptions:
     ] = None
     scanner: Annotated[Path | None, typer.Option("--scanner", help="scanner.json; else the calibration's.")] = None
     material: Annotated[str | None, typer.Option("--material", help="What the part is made of, such as Al.")] = None
-    mu: Annotated[float | None, typer.Option("--mu-per-mm", help="Its attenuation, 1/mm, in place of --material.")] = (
-        None
-    )
+    mu: Annotated[
+        float | None, typer.Option("--mu-per-mm", help="Attenuation of the part, 1/mm, in place of --material.")
+    ] = None
     kv: Annotated[
         float | None,
         typer.Option("--kv", help=f"Tube voltage for --material (mean energy); {DEFAULT_KV:g} unless given."),
@@ -83,19 +87,21 @@ class PartOptions:
         typer.Option("--commands", help="Also write the machine's own list: pi-gcs, kuka-krl, abb-rapid or ur-script."),
     ] = None
     least_transmission: Annotated[
-        float, typer.Option("--least-transmission", help="Below it a ray shows nothing of a surface.")
+        float, typer.Option("--least-transmission", help="Least transmission of a ray that shows a surface.")
     ] = 0.05
     least_view_transmission: Annotated[
-        float, typer.Option("--least-view-transmission", help="Mean that every view has to have; 0 admits all.")
+        float, typer.Option("--least-view-transmission", help="Least mean transmission of a view; 0 admits all.")
     ] = 0.0
     tangent: Annotated[
-        float, typer.Option("--tangent-deg", help="How near to the tangent plane a ray shows a surface.")
+        float, typer.Option("--tangent-deg", help="Largest angle to the tangent plane at which a ray shows a surface.")
     ] = 1.5
     tuy: Annotated[float, typer.Option("--tuy-deg", help="Soft width of the completeness.")] = 3.0
-    margin: Annotated[float, typer.Option("--margin-px", help="That the part keeps from the panel's edge.")] = 2.0
-    quanta: Annotated[float, typer.Option("--quanta", help="Of an open pixel, for the predicted uncertainty.")] = (
-        20_000.0
-    )
+    margin: Annotated[
+        float, typer.Option("--margin-px", help="Distance that the part keeps from the panel's edge.")
+    ] = 2.0
+    quanta: Annotated[
+        float, typer.Option("--quanta", help="X-ray quanta in an open pixel, for the predicted uncertainty.")
+    ] = 20_000.0
     blur: Annotated[float, typer.Option("--blur-px", help="Standard width of the unsharpness at the panel.")] = 0.5
     manipulator: Annotated[
         Path | None, typer.Option("--manipulator", help="hexapod.json: its legs have to stay within their stroke.")

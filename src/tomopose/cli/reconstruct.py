@@ -88,9 +88,9 @@ class AlgorithmOptions:
     iterations: Annotated[
         int | None, typer.Option("--iterations", min=1, help="Sweeps over all views; 1 unless given (cgls: 20).")
     ] = None
-    relaxation: Annotated[float | None, typer.Option("--relaxation", help="Above 0 and below 2; 0.8 unless given.")] = (
-        None
-    )
+    relaxation: Annotated[
+        float | None, typer.Option("--relaxation", help="Relaxation, above 0 and below 2; 0.8 unless given.")
+    ] = None
     order: Annotated[str | None, typer.Option("--order", help="golden (unless given), sequential or random.")] = None
     seed: Annotated[int | None, typer.Option("--seed", help="Random seed for the random order.")] = None
     subset_size: Annotated[

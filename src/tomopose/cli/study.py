@@ -28,7 +28,7 @@ def _show_names(wanted: bool) -> None:
 def study(
     name: Annotated[str, typer.Argument(help="table1, table2, figure8 ...; --list names them all.")],
     out: Annotated[Path | None, typer.Option("--out", help="Folder for the results; default: study-NAME.")] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of all random numbers.")] = 2023,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed for the whole study.")] = 2023,
     scale: Annotated[
         str, typer.Option("--scale", help="small: a minute or so; paper: the paper's full plan.")
     ] = "small",

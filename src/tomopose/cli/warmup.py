@@ -19,7 +19,9 @@ def register(app: typer.Typer) -> None:
 def warmup(
     only: Annotated[
         str | None,
-        typer.Option("--only", help="Of simulate, detect, calibrate, reconstruct, measure, plan; default: all."),
+        typer.Option(
+            "--only", help="Only these jobs: simulate, detect, calibrate, reconstruct, measure, plan; default: all."
+        ),
     ] = None,
     workers: Annotated[int, typer.Option("--workers", min=1, help="Processes to use.")] = os.cpu_count() or 1,
     as_json: JsonOption = False,
