@@ -215,7 +215,7 @@ class Watcher:
                 found.append((path, size))
         return found
 
-    def _show(self, state: dict[str, Any]) -> None:
+    def _show(self, state: dict[str, object]) -> None:
         with self.lock:
             self.state = state
 

@@ -181,7 +181,8 @@ def whitened_columns(problem: Problem, *J: Array) -> Array:
     inner products."""
 
     def rows(part: slice) -> Array:
-        white = [(problem.W[part] @ A[part]).reshape(-1, A.shape[2]) for A in J]
+        W = problem.W[part]
+        white = [(W @ A[part]).reshape(2 * len(W), A.shape[2]) for A in J]
         return white[0] if len(white) == 1 else np.concatenate(white, axis=1)
 
     n = len(problem)

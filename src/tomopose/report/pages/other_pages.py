@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tomopose.geometry.projection import ProjectionMatrices
+from tomopose.geometry.projection import ProjectionMatrices, ViewGeometry
 from tomopose.observations import BallObservations
 from tomopose.provenance import Provenance
 from tomopose.report.figures.coverage_figures import scan_effect
@@ -204,6 +204,40 @@ def _all_rows(observations: BallObservations) -> Section:
     )
 
 
+def _source_distance(view: ViewGeometry) -> Figure:
+    """Distance and height of the source, view by view."""
+    return Figure(
+        title="Distance of the source by view",
+        meaning="Distance of the source from the origin of W, and its height above the plane of the table.",
+        look_for="A tilted scan changes the height smoothly; a jump is a missing or exchanged pose.",
+        data=[
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "name": "distance",
+                "x": np.arange(1, len(view.source) + 1),
+                "y": np.linalg.norm(view.source, axis=1),
+                "line": {"color": ACCENT, "width": 1.8},
+            },
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "name": "height (right scale)",
+                "x": np.arange(1, len(view.source) + 1),
+                "y": view.source[:, 2],
+                "yaxis": "y2",
+                "line": {"color": ALERT, "width": 1.8},
+            },
+        ],
+        layout=layout(
+            xaxis=axis("view"),
+            yaxis=axis("distance / mm"),
+            yaxis2=axis("height / mm", overlaying="y", side="right", showgrid=False),
+        ),
+        height=340,
+    )
+
+
 def matrices_report(
     matrices: ProjectionMatrices,
     *,
@@ -216,7 +250,6 @@ def matrices_report(
     exports: names of the formats written from them.
     """
     view = matrices.decompose()
-    number_of_view = np.arange(1, len(matrices) + 1)
     effect = scan_effect(matrices)
     blocks: list[Block] = [source_path(matrices)]
     blocks.append(
@@ -228,38 +261,7 @@ def matrices_report(
             wide=False,
         )
     )
-    blocks.append(
-        Figure(
-            title="Distance of the source by view",
-            meaning="Distance of the source from the origin of W, and its height above the plane of the table.",
-            look_for="A tilted scan changes the height smoothly; a jump is a missing or exchanged pose.",
-            data=[
-                {
-                    "type": "scatter",
-                    "mode": "lines",
-                    "name": "distance",
-                    "x": number_of_view,
-                    "y": np.linalg.norm(view.source, axis=1),
-                    "line": {"color": ACCENT, "width": 1.8},
-                },
-                {
-                    "type": "scatter",
-                    "mode": "lines",
-                    "name": "height (right scale)",
-                    "x": number_of_view,
-                    "y": view.source[:, 2],
-                    "yaxis": "y2",
-                    "line": {"color": ALERT, "width": 1.8},
-                },
-            ],
-            layout=layout(
-                xaxis=axis("view"),
-                yaxis=axis("distance / mm"),
-                yaxis2=axis("height / mm", overlaying="y", side="right", showgrid=False),
-            ),
-            height=340,
-        )
-    )
+    blocks.append(_source_distance(view))
     if exports:
         blocks.append(Words(title="Written for", items=exports))
     return render(
