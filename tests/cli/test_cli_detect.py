@@ -69,6 +69,7 @@ def test_diameter_that_contradicts_the_calibration_stops_before_anything_is_writ
     assert (tmp_path / "right" / "calibration.json").exists()
 
 
+@pytest.mark.slow
 def test_the_diameter_has_no_default(radiographs, tmp_path, capsys):
     for verb in ("detect", "calibrate"):
         assert run(words(radiographs, verb, tmp_path / "out")) == 2

@@ -36,6 +36,7 @@ def test_astra_takes_the_object(matrices):
     np.testing.assert_allclose(geometry["Vectors"], np.hstack([g.source, g.centre, g.U, -g.V]), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_rtk_projects_as_the_matrices_do(matrices):
     itk = pytest.importorskip("itk")
     geometry = tp.to_rtk(matrices)

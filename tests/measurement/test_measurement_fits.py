@@ -150,6 +150,7 @@ def test_points_weigh_by_the_areas_they_represent(correlated):
         fit_plane(points, area=area[1:])
 
 
+@pytest.mark.slow
 def test_differing_neighbours_narrow_it():
     """Interpolation makes neighbours differ: errors that are differences add up to less."""
     points, _ = plane_pattern([0, 0, 0], [0, 0, 1], [4, 0, 0], [0, 4, 0], 1600)

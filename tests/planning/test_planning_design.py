@@ -84,6 +84,7 @@ def test_few_images_are_chosen_so_that_alternatives_show(paper_scanner):
     assert "5 sigma" in plan.resolved.words[0]
 
 
+@pytest.mark.slow
 def test_the_first_pose_is_repeated_and_limits_hold(turned_plan, paper_scanner):
     poses = turned_plan.poses
     np.testing.assert_array_equal(poses.T_MH.t[0], poses.T_MH.t[-1])

@@ -9,7 +9,7 @@ from every_page import every_page
 
 from browser import open_browser, open_page, violations
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 NAMES = (
     "calibration", "observations", "matrices", "comparison", "history", "certificate", "measurement", "protocol",

@@ -42,6 +42,7 @@ def scene(binning, **detector):
     )
 
 
+@pytest.mark.slow
 def test_the_binned_image_is_the_mean_of_the_detector_s_pixels():
     fine, binned = simulate(scene(1)), simulate(scene(2))
     assert binned.scanner == fine.scanner.binned(2)

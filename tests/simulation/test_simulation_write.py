@@ -70,6 +70,7 @@ def test_tiff_and_hdf5_hold_the_run_and_are_read_as_radiographs(run, tmp_path):
             write_run(folder, run, form=form)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["tiff", "hdf5"])
 def test_workers_and_an_interruption_change_no_byte(run, tmp_path, form):
     write_run(tmp_path / "whole", run, form=form)
@@ -121,6 +122,7 @@ def test_a_changed_scene_starts_anew_and_equals_a_fresh_run(run, tmp_path, form)
         assert digests(folder) == digests(tmp_path / f"fresh-{number}")
 
 
+@pytest.mark.slow
 def test_an_interrupted_stack_of_another_scene_is_not_continued(run, tmp_path):
     class StopError(Exception):
         pass
@@ -139,6 +141,7 @@ def test_an_interrupted_stack_of_another_scene_is_not_continued(run, tmp_path):
     assert frames_kept(tmp_path / "a/radiographs.h5", run_key(other, form="hdf5")) == 0
 
 
+@pytest.mark.slow
 def test_another_package_version_starts_anew(run, tmp_path, monkeypatch):
     write_run(tmp_path, run)
     monkeypatch.setattr("tomopose.kept.package_version", lambda name: "0.0.1")
@@ -214,6 +217,7 @@ def test_a_disk_without_room_for_the_stack_is_an_error(tmp_path, bytes_there):
     assert not (tmp_path / "a/radiographs.h5").exists()
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_makes_the_same_bytes(run, tmp_path):
     distributed = pytest.importorskip("distributed")
     with (

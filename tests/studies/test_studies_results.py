@@ -81,6 +81,7 @@ def test_windows_hold_the_ball_in_their_middle():
     assert np.abs(x - [(n_u - 1) / 2, (n_v - 1) / 2]).max() <= 0.5
 
 
+@pytest.mark.slow
 def test_the_papers_solution_states_the_size_of_its_errors():
     run = table1.ball_run(5.3, 3, 1)
     inside = []
@@ -204,12 +205,14 @@ def test_turning_the_table_helps():
     assert row.best < 0.8 * row.paper_method
 
 
+@pytest.mark.slow
 def test_error_correction_helps_where_the_machine_errs():
     found = improvements.solve_case("error correction, 189 mixed poses at four table angles", 11)
     assert found["best"] < found["rigid"] / 5
     assert found["best"] < 3 * found["u"]
 
 
+@pytest.mark.slow
 def test_a_source_and_detector_that_move_are_corrected_too():
     found = improvements.solve_case("C-arm, 100 views, two balls of known distance", 5)
     assert found["best"] < found["rigid"] / 5

@@ -161,6 +161,7 @@ def test_true_lengths_differ_from_nominal_ones_by_the_form_only():
         assert 0 < abs(value - nominal[name]) < 0.06  # mm: 8 um of form, over levers
 
 
+@pytest.mark.slow
 def test_a_circle_sees_upright_walls_and_not_what_faces_up():
     mesh = reference(TINY.edge)
     source = source_path(scan_with("specimen", "circular", TINY, 5).truth)
