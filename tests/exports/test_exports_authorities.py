@@ -226,6 +226,7 @@ def rtk_axes(folder):
     return A, R
 
 
+@pytest.mark.slow
 def test_rtk_reads_our_xml(matrices, folder):
     rtk, itk = rtk_module(), package("itk")
     reader = rtk.ThreeDCircularProjectionGeometryXMLFileReader.New()
@@ -239,6 +240,7 @@ def test_rtk_reads_our_xml(matrices, folder):
     np.testing.assert_allclose(pixels(-np.linalg.inv(A) @ M @ R, X), matrices.project(X), rtol=0, atol=TOLERANCE_PX)
 
 
+@pytest.mark.slow
 def test_rtk_finds_the_same_nine_parameters(matrices, folder):
     """AddProjection decomposes the matrix itself; it answers False, and drops the view, where it cannot."""
     rtk, itk = rtk_module(), package("itk")
@@ -265,6 +267,7 @@ def test_rtk_finds_the_same_nine_parameters(matrices, folder):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-9, err_msg=name)
 
 
+@pytest.mark.slow
 def test_we_read_what_rtk_writes(matrices, folder, tmp_path):
     rtk, itk = rtk_module(), package("itk")
     A, R = rtk_axes(folder)
@@ -279,6 +282,7 @@ def test_we_read_what_rtk_writes(matrices, folder, tmp_path):
     np.testing.assert_allclose(back.project(X), matrices.project(X), rtol=0, atol=TOLERANCE_PX)
 
 
+@pytest.mark.slow
 def test_rtk_draws_a_sphere_where_the_matrices_put_it(tmp_path):
     """Through RTK's own ray tracer: origin, spacing, axes and row order of rtk.json, not only the matrices."""
     rtk, itk = rtk_module(), package("itk")
