@@ -137,7 +137,7 @@ def deviation_figure(
     look_for: str,
     azimuth_deg: float = -60.0,
     elevation_deg: float = 20.0,
-    px_per_mm: float = 9.0,
+    px_per_mm: float = 8.0,
 ) -> Figure:
     """One picture of the mesh for each name -> deviations (n,), um, side by side on one colour scale."""
     R = viewpoint(azimuth_deg, elevation_deg)
