@@ -20,12 +20,11 @@ from tomopose.report.figures.measurement_figures import (
     group_bars,
 )
 from tomopose.report.page import BAD, CARE, GOOD, Block, KeyFigure, Page, Section, Table, Verdict, Words, render
+from tomopose.report.sections.budget import MANY, budget_sections, micrometres
 from tomopose.report.sections.provenance import provenance_section
 from tomopose.report.words import NOT_DETERMINABLE, number
 from tomopose.units import MICROMETRES_PER_MM, Array
 
-MANY = 40
-"""Results of one kind from which they are shown by number instead of by name."""
 FORM_NAMES = {"form": "all points", "form_95": "95 % of the points", "form_25": "25 patches"}
 
 
@@ -45,7 +44,7 @@ def measurement_report(
             title="Errors", lead="Measured minus calibrated value, beside what is permitted.", blocks=_errors(results)
         ),
         Section(title="All results", blocks=[_rows(results), *_repeats(results)]),
-        *_budgets(results),
+        *budget_sections(results),
     ]
     for name, comparison in (comparisons or {}).items():
         sections.insert(1, _comparison(name, comparison, range_mm))
@@ -65,12 +64,6 @@ def measurement_report(
             footer="Written by tomopose. Intervals of single results are 95 % of the fit's own scatter.",
         )
     )
-
-
-def _um(value: float | None, signed: bool = False) -> str:
-    if value is None or not math.isfinite(value):
-        return NOT_DETERMINABLE
-    return f"{value * MICROMETRES_PER_MM:+.2f}" if signed else f"{value * MICROMETRES_PER_MM:.2f}"
 
 
 def _verdict(results: MeasurementResults) -> Verdict:
@@ -114,7 +107,7 @@ def _shown(value: float | None, unit: str, *, signed: bool = False) -> str:
     if value is None or not math.isfinite(value):
         return NOT_DETERMINABLE
     if unit == "mm":
-        return f"{_um(value, signed)} µm"
+        return f"{micrometres(value, signed)} µm"
     seconds = math.degrees(value) * 3600
     return f"{seconds:+.1f} arcsec" if signed else f"{seconds:.1f} arcsec"
 
@@ -140,12 +133,12 @@ def _keys(results: MeasurementResults) -> list[KeyFigure]:
         keys += [
             KeyFigure(
                 name="Largest length error",
-                value=f"{_um(largest)} µm",
+                value=f"{micrometres(largest)} µm",
                 note=f"{largest / spacing:.3f} of a voxel; compare it with what is permitted.",
             ),
             KeyFigure(
                 name="Rms of length errors",
-                value=f"{_um(float(np.sqrt(np.mean(errors**2))))} µm",
+                value=f"{micrometres(float(np.sqrt(np.mean(errors**2))))} µm",
                 note="Of all distances, diameters and positions: the usual error.",
             ),
         ]
@@ -262,72 +255,15 @@ def _repeats(results: MeasurementResults) -> list[Block]:
                     r.name,
                     str(r.n),
                     f"{r.mean:.5f}",
-                    _um(r.s),
-                    "–" if r.error is None else _um(r.error, True),
-                    _um(r.U),
-                    _um(r.U_mean),
+                    micrometres(r.s),
+                    "–" if r.error is None else micrometres(r.error, True),
+                    micrometres(r.U),
+                    micrometres(r.U_mean),
                     r.interval,
                 ]
                 for r in found
             ],
             folded=len(found) > MANY,
-        )
-    ]
-
-
-def _budgets(results: MeasurementResults) -> list[Section]:
-    """Where the uncertainty comes from, where more than the fit is known."""
-    found = [b for b in results.budgets() if b.unit == "mm"]
-    stated = ("repeats", "calibration", "simulation", "workpiece", "temperature")
-    if not any(getattr(b, name) is not None for b in found for name in stated):
-        return []
-
-    def cells(b: Budget) -> list[str]:
-        shares = [
-            "–" if u is None or not math.isfinite(u) else _um(u)
-            for u in (b.fit, b.repeats, b.calibration, b.simulation, b.workpiece, b.temperature)
-        ]
-        corrected = ["–", "–"] if b.mean_error is None else [_um(b.mean_error, True), f"{b.corrected:.5f}"]
-        return [
-            b.volume,
-            b.name,
-            f"{b.value:.5f}",
-            *shares,
-            *corrected,
-            _um(b.U) if math.isfinite(b.U) else "–",
-            b.interval,
-        ]
-
-    return [
-        Section(
-            title="Uncertainty",
-            lead="Standard uncertainties, each by itself, and the 95 % interval of all together.",
-            blocks=[
-                Table(
-                    title="Shares",
-                    meaning="Fit and repeats show the same scatter, the larger counts; the calibration's share is "
-                    "added in squares. Virtual scans hold noise and systematic part, and cover all: their mean "
-                    "error is taken off the value, and U is that of one more scan like them.",
-                    columns=[
-                        "volume",
-                        "name",
-                        "measured / mm",
-                        "fit / µm",
-                        "repeats / µm",
-                        "calibration / µm",
-                        "simulation / µm",
-                        "workpiece / µm",
-                        "temperature / µm",
-                        "its mean error / µm",
-                        "corrected by simulation / mm",
-                        "U / µm",
-                        "holds",
-                    ],
-                    numeric=tuple(range(2, 12)),
-                    rows=[cells(b) for b in found],
-                    folded=len(found) > MANY,
-                )
-            ],
         )
     ]
 
@@ -342,9 +278,9 @@ def _features(results: MeasurementResults) -> Section:
             str(len(f.points)),
             str(f.n_set_aside),
             f"{f.n_effective:.0f}",
-            _um(f.rms),
-            _um(f.form),
-            _um(f.form_95),
+            micrometres(f.rms),
+            micrometres(f.form),
+            micrometres(f.form_95),
         ]
         for v, found in results.features.items()
         for name, f in found.items()
@@ -387,14 +323,14 @@ def _comparison(name: str, comparison: Comparison, range_mm: float) -> Section:
         meaning="",
         columns=["share", "deviation / µm"],
         numeric=(1,),
-        rows=[[k, _um(v, True)] for k, v in comparison.percentiles().items()],
+        rows=[[k, micrometres(v, True)] for k, v in comparison.percentiles().items()],
     )
     moved = Words(
         title="Alignment",
         paragraphs=[
             f"Rule: {comparison.alignment.rule}. Part to W: rotation vector "
             f"{_vector(1000 * log_rotation(comparison.alignment.R))} mrad, translation "
-            f"{_vector(comparison.alignment.t)} mm. Moved by {_um(comparison.moved_mm)} µm and turned by "
+            f"{_vector(comparison.alignment.t)} mm. Moved by {micrometres(comparison.moved_mm)} µm and turned by "
             f"{comparison.turned_rad * 1e6:.1f} µrad by the fit. Within ±{limit:g} µm: "
             f"{100 * comparison.share_within(range_mm):.1f} % of {len(comparison.measured)} vertices."
         ],
