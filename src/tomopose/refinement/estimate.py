@@ -34,7 +34,7 @@ Progress = Callable[[int, int], None] | None
 class Estimate:
     """state, prior: with the sizes of the evidence; faces, edges: of the grid and of the images that the object
     crosses; data: without the rays that meet what lies beyond the faces; judged: the binning at which the held-out
-    pixels are compared."""
+    pixels are compared; K: (n, m, 2, 6), px per motion, of `points_of` the grid."""
 
     state: State
     prior: Prior
@@ -42,6 +42,7 @@ class Estimate:
     edges: tuple[str, ...]
     data: Measured
     judged: int
+    K: Array
 
 
 class Steps:
@@ -84,6 +85,7 @@ def estimate(
         edges=edges,
         data=without_rays(data, reached.faces),
         judged=max(factors[reached.levels - 1], min(2, factors[0])),
+        K=K,
     )
 
 

@@ -23,7 +23,7 @@ from tomopose.refinement.halves import halves_px
 from tomopose.refinement.joint_fit.fit import Fit, linearised
 from tomopose.refinement.joint_fit.linear import normal_blocks
 from tomopose.refinement.joint_fit.measured import measured, rays_through
-from tomopose.refinement.joint_fit.motions import pixel_jacobian, transforms
+from tomopose.refinement.joint_fit.motions import transforms
 from tomopose.refinement.joint_fit.pyramid import level_of
 from tomopose.refinement.judge import Evidence, Verdict, decide, trial
 from tomopose.refinement.result import Refinement
@@ -111,7 +111,7 @@ def assessed(
     found: Estimate, matrices: ProjectionMatrices, s: RefineSettings, threads: int, steps: Steps
 ) -> Refinement:
     """What the estimate is worth: the judgement of the held-out pixels, the uncertainty, and what is not observable."""
-    data, state, prior = found.data, found.state, found.prior
+    data, state, prior, K = found.data, found.state, found.prior, found.K
     centre, radius = np.asarray(data.grid.centre), radius_of(data.grid)
     level = level_of(data, found.judged)
     fit = Fit(precision=prior.precision, steps=3, turns=s.turns, threads=threads)
@@ -121,7 +121,6 @@ def assessed(
     here = linearised(level, at, threads=threads)
     information = normal_blocks(here.motions, here.weighed(level))
     left = 1.0 - float(rays_through(level, found.faces).mean()) if found.faces else 1.0
-    K = pixel_jacobian(data.matrices.P, points_of(data.grid), centre)
     open_ = () if found.faces else open_directions(information, prior, K, radius)
     errors = drawn_errors(level, at, here, prior, samples=s.samples, turns=s.turns, seed=s.seed)
     widening = widening_of(errors, information, prior, K)

@@ -73,11 +73,21 @@ class Widening:
         return float(np.sqrt(self.points.mean()))
 
 
+def with_volume_held(information: Array, prior: Prior) -> Array:
+    """(n, 6, 6) covariance of each view's motion with the volume known, by information (n, 6, 6) and prior."""
+    return np.asarray(np.linalg.inv(information + np.linalg.inv(prior.blocks)))
+
+
+def of_points(covariance: Array, K: Array) -> Array:
+    """(n, m, 2) px^2: variance of points under motions of that covariance (n, 6, 6); K (n, m, 2, 6), px each."""
+    return np.asarray(np.einsum("nmic,ncd,nmid->nmi", K, covariance, K))
+
+
 def widening_of(errors: Array, information: Array, prior: Prior, K: Array) -> Widening:
     """From draws (s, n, 6), each view's information (n, 6, 6) of the same level, and K (n, m, 2, 6), px per motion."""
-    known = np.linalg.inv(information + np.linalg.inv(prior.blocks))
+    known = with_volume_held(information, prior)
     drawn = np.einsum("nmic,snc->snmi", K, errors)
-    with_volume_known = np.einsum("nmic,ncd,nmid->nmi", K, known, K)
+    with_volume_known = of_points(known, K)
     root = np.sqrt(np.einsum("ncc->nc", prior.blocks).mean(axis=0))
     motions = ((errors / root) ** 2).mean() / np.mean(np.einsum("ncc->nc", known) / root**2)
     return Widening(
@@ -92,10 +102,8 @@ def spread_of(widening: Widening, information: Array, prior: Prior, K: Array) ->
     The information holds the size of the residual already: where the voxels do not explain the images to their noise,
     the weights are as much smaller (Birge ratio).
     """
-    blocks = prior.blocks
-    known = np.linalg.inv(information + np.linalg.inv(blocks))
-    with_volume_known = np.einsum("nmic,ncd,nmid->nmi", K, known, K)
-    prior_points = np.einsum("nmic,ncd,nmid->nmi", K, blocks, K)
+    blocks, known = prior.blocks, with_volume_held(information, prior)
+    with_volume_known, prior_points = of_points(known, K), of_points(blocks, K)
     wide = MODEL_ERROR**2
     variance = np.minimum(wide * with_volume_known * widening.points, np.maximum(prior_points, with_volume_known))
     return Spread(
