@@ -13,8 +13,8 @@ from tomopose.calibration.model.twin_projection import twin_blocks, twin_view_ma
 from tomopose.calibration.uncertainty.trajectory import object_points, rms_px
 from tomopose.geometry.object_pose import without_object_pose
 from tomopose.geometry.rotations import R_x, R_y, R_z
+from tomopose.geometry.transforms import moved
 from tomopose.manipulator.inverse import inverse_poses
-from tomopose.manipulator.real_poses import moved
 from tomopose.manipulator.serial import SerialRobot, poses_from_joints
 from tomopose.manipulator.twin import TwinRobots
 

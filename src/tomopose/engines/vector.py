@@ -328,43 +328,32 @@ def _value_and_slopes(builder: ir.IRBuilder, *place: ir.Value) -> tuple[ir.Value
     return value, slope_a, builder.fmul(step, slope_a), slope_b, builder.fmul(step, slope_b)
 
 
-@intrinsic
-def forward_block(
-    typingctx: Context,
-    volume: types.Type,
-    base: types.Type,
-    plane: types.Type,
-    row: types.Type,
-    rays: types.Type,
-    planes: types.Type,
-    ends: types.Type,
-    sums: types.Type,
-) -> Intrinsic:
-    """sums[l] = sum over planes k_0 <= k < k_1 of the volume at (a_l(k), b_l(k)): Joseph's sum for W rays.
+def _ray_block(number: int, terms: Terms) -> Block:
+    @intrinsic
+    def block(
+        typingctx: Context,
+        volume: types.Type,
+        base: types.Type,
+        plane: types.Type,
+        row: types.Type,
+        rays: types.Type,
+        planes: types.Type,
+        ends: types.Type,
+        sums: types.Type,
+    ) -> Intrinsic:
+        """sums[i W + l] = sum over planes k_0 <= k < k_1 of term i of the volume at (a_l(k), b_l(k)), for W rays.
 
-    volume[base] is voxel (0, 0) of plane 0; planes lie `plane` elements apart, rows along a `row` (int32), b is
-    contiguous.  rays holds a, da, b, db for each lane (4 W values): a(k) = a + (k - centre) da.  planes: (k_0, k_1);
-    ends: (centre, a_end, b_end), float32.  Positions are held within [-1, a_end] and [-1, b_end], where the volume's
-    margin is zero.
-    """
-    return _sums_of_rays((volume, rays, sums), 1, _value)
+        volume[base] is voxel (0, 0) of plane 0; planes lie `plane` elements apart, rows along a `row` (int32), b is
+        contiguous.  rays holds a, da, b, db for each lane (4 W values): a(k) = a + (k - centre) da.  planes: (k_0,
+        k_1);  ends: (centre, a_end, b_end), float32.  Positions are held within [-1, a_end] and [-1, b_end], where the
+        volume's margin is zero.
+        """
+        return _sums_of_rays((volume, rays, sums), number, terms)
+
+    return block
 
 
-@intrinsic
-def derivative_block(
-    typingctx: Context,
-    volume: types.Type,
-    base: types.Type,
-    plane: types.Type,
-    row: types.Type,
-    rays: types.Type,
-    planes: types.Type,
-    ends: types.Type,
-    sums: types.Type,
-) -> Intrinsic:
-    """As `forward_block`, with the slopes in the same walk: five sums for each of W rays.
-
-    sums (5 W,): of the volume f, df/da, (k - centre) df/da, df/db and (k - centre) df/db, over the planes
-    k_0 <= k < k_1.
-    """
-    return _sums_of_rays((volume, rays, sums), 5, _value_and_slopes)
+forward_block = _ray_block(1, _value)
+"""Joseph's sums: one term, the volume f."""
+derivative_block = _ray_block(5, _value_and_slopes)
+"""The same walk with the slopes: five terms, f, df/da, (k - centre) df/da, df/db and (k - centre) df/db."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tomopose.geometry.rotations import exp_rotation, skew
+from tomopose.geometry.rotations import skew
+from tomopose.geometry.transforms import moved
 from tomopose.least_squares import least_squares
 from tomopose.units import Array
 
-STEPS = 50
 STEPS, STILL = 50, 1e-12
 """Steps at the most; px, rms: a step that moves the images by less ends the iteration."""
 
@@ -22,12 +22,16 @@ def pixels(P: Array, x: Array) -> Array:
     return result
 
 
+def pixels_and_jacobian(P: Array, x: Array) -> tuple[Array, Array]:
+    """Pixels (n, m, 2) of points x (m, 3) under matrices P (n, 3, 4), and d(u, v)/dx (n, m, 2, 3)."""
+    h = np.einsum("nij,mj->nmi", P[:, :, :3], x) + P[:, None, :, 3]
+    u, w = h[..., :2] / h[..., 2:], h[..., 2:]
+    return u, (P[:, None, :2, :3] - u[..., None] * P[:, None, 2:, :3]) / w[..., None]
+
+
 def point_jacobian(P: Array, x: Array) -> Array:
     """d(u, v)/dx (n, m, 2, 3) of points x (m, 3) under matrices P (n, 3, 4)."""
-    h = np.einsum("nij,mj->nmi", P[:, :, :3], x) + P[:, None, :, 3]
-    w = h[..., 2:]
-    result: Array = (P[:, None, :2, :3] - (h[..., :2] / w)[..., None] * P[:, None, 2:, :3]) / w[..., None]
-    return result
+    return pixels_and_jacobian(P, x)[1]
 
 
 def object_pose(P: ArrayLike, target: ArrayLike, points: ArrayLike) -> tuple[Array, Array]:
@@ -39,14 +43,12 @@ def object_pose(P: ArrayLike, target: ArrayLike, points: ArrayLike) -> tuple[Arr
     def rows(pose: tuple[Array, Array]) -> tuple[Array, Array]:
         R, t = pose
         y = (x - middle) @ R.T + t
-        G = point_jacobian(P, y)
+        u, G = pixels_and_jacobian(P, y)
         J = np.concatenate([-G @ skew(y - t), G], axis=3)
-        return (seen - pixels(P, y)).ravel(), J.reshape(-1, 6)
+        return (seen - u).ravel(), J.reshape(-1, 6)
 
-    def moved(pose: tuple[Array, Array], step: Array) -> tuple[Array, Array]:
-        return np.asarray(exp_rotation(step[:3]) @ pose[0]), pose[1] + step[3:]
-
-    R, t = least_squares(rows, moved, (np.eye(3), middle), steps=STEPS, tolerance=STILL).state
+    start = (np.eye(3), middle)
+    R, t = least_squares(rows, lambda pose, step: moved(*pose, step), start, steps=STEPS, tolerance=STILL).state
     return R, t - R @ middle
 
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from tomopose.errors import FrameMismatchError, InputError, ShapeError
 from tomopose.geometry.frames import Frame
-from tomopose.geometry.rotations import angles_from_rotation, log_rotation, rotation_from_angles, skew
+from tomopose.geometry.rotations import angles_from_rotation, exp_rotation, log_rotation, rotation_from_angles, skew
 from tomopose.units import Array, float_array
 from tomopose.values import value
 
@@ -25,6 +25,11 @@ def _away_from_rotation(R: Array) -> tuple[float, float]:
     lengths = (a * a + b * b + c * c - 1, d * d + e * e + f * f - 1, g * g + h * h + i * i - 1)
     angles = (a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i)
     return max(map(abs, (*lengths, *angles))), a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
+
+
+def moved(R: Array, t: Array, delta: Array) -> tuple[Array, Array]:
+    """The poses (R, t) after the motions delta (..., 6) = (w, t), rad and mm, along the axes of their target frame."""
+    return exp_rotation(delta[..., :3]) @ R, t + delta[..., 3:]
 
 
 @value

@@ -21,10 +21,10 @@ import numpy as np
 
 from tomopose.errors import InputError, OutOfReachError, ShapeError
 from tomopose.geometry.rotations import log_rotation
-from tomopose.geometry.transforms import RigidTransform
+from tomopose.geometry.transforms import RigidTransform, moved
 from tomopose.manipulator.inverse import InverseManipulator, inverse_poses
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.manipulator.real_poses import ErrorModel, RealPoses, moved
+from tomopose.manipulator.real_poses import ErrorModel, RealPoses
 from tomopose.manipulator.run_effects import with_run_effects
 from tomopose.manipulator.serial import SerialRobot
 from tomopose.manipulator.twin import TwinRobots, twin_names

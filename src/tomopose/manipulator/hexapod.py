@@ -29,8 +29,9 @@ import numpy as np
 
 from tomopose.errors import InputError, OutOfReachError, ShapeError, TrajectoryError
 from tomopose.geometry.rotations import exp_rotation, skew
+from tomopose.geometry.transforms import moved
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.manipulator.real_poses import RealPoses, Repeatability, left_jacobian, moved
+from tomopose.manipulator.real_poses import RealPoses, Repeatability, left_jacobian
 from tomopose.units import Array, float_array
 from tomopose.values import value
 

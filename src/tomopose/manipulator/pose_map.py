@@ -24,8 +24,9 @@ import numpy as np
 
 from tomopose.errors import InputError, ShapeError
 from tomopose.geometry.rotations import log_rotation
+from tomopose.geometry.transforms import moved
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.manipulator.real_poses import RealPoses, Repeatability, left_jacobian, moved
+from tomopose.manipulator.real_poses import RealPoses, Repeatability, left_jacobian
 from tomopose.units import Array
 
 COORDINATES = ("x", "y", "z", "wx", "wy", "wz")

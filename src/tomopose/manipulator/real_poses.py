@@ -13,7 +13,6 @@ import numpy as np
 
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
-from tomopose.geometry.rotations import exp_rotation
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.units import Array
@@ -103,8 +102,3 @@ def left_jacobian(w: Array) -> Array:
     W -= np.swapaxes(W, -1, -2)
     result: Array = np.eye(3) + a * W + b * (W @ W)
     return result
-
-
-def moved(R: Array, t: Array, delta: Array) -> tuple[Array, Array]:
-    """The poses (R, t) after the small motions delta (n, 6) = (w, t) in H."""
-    return exp_rotation(delta[..., :3]) @ R, t + delta[..., 3:]

@@ -18,9 +18,10 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 
 from tomopose.geometry.rotations import exp_rotation, log_rotation
+from tomopose.geometry.transforms import moved
 from tomopose.manipulator.hexapod import Hexapod
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.manipulator.real_poses import ErrorModel, RealPoses, Repeatability, left_jacobian, moved
+from tomopose.manipulator.real_poses import ErrorModel, RealPoses, Repeatability, left_jacobian
 from tomopose.manipulator.serial import SerialRobot
 from tomopose.units import Array
 

@@ -13,10 +13,10 @@ import numpy as np
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import exp_rotation
-from tomopose.geometry.transforms import RigidTransform
+from tomopose.geometry.transforms import RigidTransform, moved
 from tomopose.manipulator.hexapod import Hexapod
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.manipulator.real_poses import ErrorModel, Repeatability, moved
+from tomopose.manipulator.real_poses import ErrorModel, Repeatability
 from tomopose.manipulator.run_effects import last_direction
 from tomopose.manipulator.serial import Joint, SerialRobot
 from tomopose.units import Array

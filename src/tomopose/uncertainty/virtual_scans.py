@@ -28,9 +28,8 @@ from tomopose.geometry.object_pose import object_pose, pixels
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
 from tomopose.geometry.rotations import exp_rotation
 from tomopose.geometry.scanner import Scanner
-from tomopose.geometry.transforms import RigidTransform
+from tomopose.geometry.transforms import RigidTransform, moved
 from tomopose.manipulator.error_models import RigidErrors, correction
-from tomopose.manipulator.real_poses import moved
 from tomopose.measurement.measure import measure
 from tomopose.measurement.plan import MeasurementPlan
 from tomopose.measurement.result import MeasurementResult

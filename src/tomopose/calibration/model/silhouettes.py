@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from tomopose.calibration.model.problem import Problem
@@ -10,16 +12,38 @@ from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
 
 
+@dataclass(frozen=True, kw_only=True)
+class Cameras:
+    """P (n, 3, 4): from T to pixels, of every row;  d_SR (n,) mm;  source (3,): where the
+    source is in T in the first pose, mm."""
+
+    P: Array
+    d_SR: Array
+    source: Array
+
+    @classmethod
+    def of(cls, problem: Problem) -> Cameras:
+        """Of the scanners at the table angles of a problem."""
+        P, d_SR, source = np.empty((len(problem), 3, 4)), np.empty(len(problem)), np.zeros(3)
+        for r, scanner in enumerate(problem.scanners):
+            alone = len(problem.scanners) == 1
+            mine = slice(None) if alone else problem.run == r
+            alpha, which = np.unique(problem.alpha[mine], return_inverse=True)
+            T_WS, T_TW = scanner.T_WS.matrix, scanner.T_TW(alpha)
+            P[mine] = (scanner.P_S @ T_WS @ T_TW.matrix)[which.reshape(-1)]
+            d_SR[mine] = scanner.d_SR
+            if r == problem.run[0]:
+                first = int(which.reshape(-1)[0])
+                at_W = -T_WS[:3, :3].T @ T_WS[:3, 3]
+                source = T_TW.R[first].T @ (at_W - T_TW.t[first])
+        return cls(P=P, d_SR=d_SR, source=source)
+
+
 def chain_matrices(problem: Problem, scanners: tuple[Scanner, ...], T_HT: RigidTransform) -> Array:
     """(n, 3, 4): from the moved plate M to pixels, of every row's pose as reported."""
     T_MH = np.zeros((len(problem), 4, 4))
     T_MH[:, :3, :3], T_MH[:, :3, 3], T_MH[:, 3, 3] = problem.R_MH, problem.t_MH, 1.0
-    P = np.empty((len(problem), 3, 4))
-    for r, scanner in enumerate(scanners):
-        mine = slice(None) if len(scanners) == 1 else problem.run == r
-        alpha, which = np.unique(problem.alpha[mine], return_inverse=True)
-        P[mine] = (scanner.P_S @ scanner.T_WS.matrix @ scanner.T_TW(alpha).matrix)[which.reshape(-1)]
-    return P @ T_HT.matrix @ T_MH
+    return np.asarray(Cameras.of(replace(problem, scanners=scanners)).P @ T_HT.matrix @ T_MH)
 
 
 def silhouette_outlines(P: Array, centres: Array, diameter: float) -> Array:

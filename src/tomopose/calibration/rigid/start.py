@@ -17,6 +17,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.model.silhouettes import Cameras
 from tomopose.calibration.model.tall import parts
 from tomopose.units import Array
 
@@ -34,32 +35,6 @@ class Rays:
     n: Array
     d: Array
     source: Array
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cameras:
-    """P (n, 3, 4): from T to pixels, of every row;  d_SR (n,) mm;  source (3,): as of `Rays`."""
-
-    P: Array
-    d_SR: Array
-    source: Array
-
-    @classmethod
-    def of(cls, problem: Problem) -> Cameras:
-        """Of the scanners at the table angles of a problem."""
-        P, d_SR, source = np.empty((len(problem), 3, 4)), np.empty(len(problem)), np.zeros(3)
-        for r, scanner in enumerate(problem.scanners):
-            alone = len(problem.scanners) == 1
-            mine = slice(None) if alone else problem.run == r
-            alpha, which = np.unique(problem.alpha[mine], return_inverse=True)
-            T_WS, T_TW = scanner.T_WS.matrix, scanner.T_TW(alpha)
-            P[mine] = (scanner.P_S @ T_WS @ T_TW.matrix)[which.reshape(-1)]
-            d_SR[mine] = scanner.d_SR
-            if r == problem.run[0]:
-                first = int(which.reshape(-1)[0])
-                at_W = -T_WS[:3, :3].T @ T_WS[:3, 3]
-                source = T_TW.R[first].T @ (at_W - T_TW.t[first])
-        return cls(P=P, d_SR=d_SR, source=source)
 
 
 def ray_equations(problem: Problem, cameras: Cameras | None = None) -> Rays:

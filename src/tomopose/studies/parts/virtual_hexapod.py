@@ -26,10 +26,10 @@ from tomopose.geometry.object_pose import without_object_pose
 from tomopose.geometry.projection import eq5_matrices
 from tomopose.geometry.rotations import exp_rotation
 from tomopose.geometry.scanner import Scanner
-from tomopose.geometry.transforms import RigidTransform
+from tomopose.geometry.transforms import RigidTransform, moved
 from tomopose.manipulator.hexapod import Hexapod
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.manipulator.real_poses import Repeatability, moved
+from tomopose.manipulator.real_poses import Repeatability
 from tomopose.manipulator.virtual import typical_hexapod
 from tomopose.studies.demo import demo_setup, paper_scanner
 from tomopose.studies.parts.radiographs import BallRun

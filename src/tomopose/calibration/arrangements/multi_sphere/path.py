@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tomopose.calibration.arrangements.multi_sphere.view_pose import moved, poses_of_views, view_rows
+from tomopose.calibration.arrangements.multi_sphere.view_pose import moved_by, poses_of_views, view_rows
 from tomopose.calibration.model.assumed import Assumed
 from tomopose.calibration.model.ball_projection import whiteners
 from tomopose.errors import NotConvergedError
@@ -134,7 +134,7 @@ def solve_path(
         largest = float(np.abs(step / np.sqrt(np.diag(C))).max()) if len(step) else 0.0
         for j, p in enumerate(parts):
             turn = np.linalg.solve(p.N, p.Nz - p.NB @ step)
-            T[j] = moved(T[j], turn)
+            T[j] = moved_by(T[j], turn)
             largest = max(largest, float(np.abs(turn * np.sqrt(np.diag(p.N))).max()))
     raise NotConvergedError(
         f"the path still moves by {largest:.3g} standard uncertainties after {STEPS} steps; check the ids of the balls"

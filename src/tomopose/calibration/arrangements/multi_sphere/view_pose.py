@@ -17,9 +17,11 @@ from tomopose.calibration.arrangements.multi_sphere.standard import FEWEST_BALLS
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS, projection_blocks, whiteners
 from tomopose.errors import InputError, NotConvergedError, NotObservableError
 from tomopose.geometry.frames import Frame
-from tomopose.geometry.rotations import exp_rotation, skew
+from tomopose.geometry.object_pose import point_jacobian
+from tomopose.geometry.projection import project
+from tomopose.geometry.rotations import skew
 from tomopose.geometry.scanner import Scanner
-from tomopose.geometry.transforms import RigidTransform
+from tomopose.geometry.transforms import RigidTransform, moved
 from tomopose.least_squares import Solution, least_squares
 from tomopose.units import Array
 from tomopose.values import require_types, value
@@ -115,8 +117,10 @@ def view_rows(
     return b.x_D, J, b.J_t, b.J_scanner[:, :, [SCANNER_COLUMNS.index(n) for n in names]]
 
 
-def moved(T: RigidTransform, step: Array) -> RigidTransform:
-    return RigidTransform(R=exp_rotation(step[:3]) @ T.R, t=T.t + step[3:], source=T.source, target=T.target)
+def moved_by(T: RigidTransform, step: Array) -> RigidTransform:
+    """The pose after a motion (w, t) (6,), rad and mm, along the axes of its target frame."""
+    R, t = moved(T.R, T.t, step)
+    return RigidTransform(R=R, t=t, source=T.source, target=T.target)
 
 
 def _nearest_pose(
@@ -129,17 +133,14 @@ def _nearest_pose(
         r, J = _residuals(P, T, x_D, balls)
         return np.asarray(W @ r[:, :, None]).ravel(), np.asarray(W @ J).reshape(-1, 6)
 
-    return least_squares(rows, moved, start, steps=steps, tolerance=TOLERANCE)
+    return least_squares(rows, moved_by, start, steps=steps, tolerance=TOLERANCE)
 
 
 def _residuals(P: Array, T: RigidTransform, x_D: Array, balls: Array) -> tuple[Array, Array]:
     """Residuals (m, 2) px under P (3, 4) of points of W, and the derivatives (m, 2, 6) of the places by (w, t) of the
-    pose; nan for balls behind the source."""
+    pose; residuals are nan for balls behind the source."""
     turned = balls @ T.R.T
-    h = (turned + T.t) @ P[:, :3].T + P[:, 3]
-    w = np.where(h[:, 2:] > 0, h[:, 2:], np.nan)
-    x = h[:, :2] / w
-    G = (P[None, :2, :3] - x[:, :, None] * P[None, 2:, :3]) / w[:, :, None]
+    x, G = project(P, turned + T.t), point_jacobian(P[None], turned + T.t)[0]
     # dx = G (w x R b + t): row i of -G [R b]_x is G_i cross R b with its sign turned
     J = np.concatenate([np.cross(turned[:, None], G), G], axis=2)
     return x_D - x, J

@@ -35,9 +35,10 @@ from tomopose.calibration.checks.placement import Placement, beams, better_place
 from tomopose.calibration.checks.stability import SIGNIFICANT, Effect, chi2_with_movements, movements
 from tomopose.calibration.model.parameters import UNITS, FreeParameters, free_parameters
 from tomopose.calibration.model.problem import Problem, pair
+from tomopose.calibration.model.silhouettes import Cameras
 from tomopose.calibration.rigid.estimate import best_fit
 from tomopose.calibration.rigid.fit import Fit, residuals
-from tomopose.calibration.rigid.start import Cameras, ray_equations
+from tomopose.calibration.rigid.start import ray_equations
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.inverse import inverse_poses

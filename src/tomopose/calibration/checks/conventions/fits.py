@@ -19,9 +19,9 @@ from tomopose.calibration.model.parameters import (
     free_parameters,
 )
 from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.model.silhouettes import size_ratio_of
+from tomopose.calibration.model.silhouettes import Cameras, size_ratio_of
 from tomopose.calibration.rigid.fit import Fit, balls_in_table, minimise, residuals, whitened2
-from tomopose.calibration.rigid.start import Cameras, Rays, closed_forms, other_starts, ray_equations, turned_about_beam
+from tomopose.calibration.rigid.start import Rays, closed_forms, other_starts, ray_equations, turned_about_beam
 from tomopose.units import Array
 
 ITERATIONS = 20
