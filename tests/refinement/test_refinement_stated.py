@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import tomopose as tp
-from tomopose.calibration.uncertainty.trajectory import plate_points, scatter_variance, shared_variance
+from tomopose.calibration.uncertainty.trajectory import plate_points, scatter_variance, trajectory_sigma
 from tomopose.refinement.joint_fit.motions import pixel_jacobian
 from tomopose.refinement.stated import points_of, prior_of, shared_motions
 
@@ -34,7 +34,7 @@ def test_the_calibrations_covariance_becomes_motions_that_move_pixels_by_the_sam
     K = pixel_jacobian(matrices.P, points, np.asarray(GRID.centre))
     moved = np.einsum("nmic,ncp->nmip", K, L)
     variance = np.einsum("nmip,pq,nmiq->nmi", moved, C, moved)
-    expected = shared_variance(calibration, scan, plate_points(calibration, points))
+    expected = trajectory_sigma(calibration, scan, points) ** 2
     np.testing.assert_allclose(variance, expected, rtol=0.1, atol=1e-3 * expected.max())
 
 

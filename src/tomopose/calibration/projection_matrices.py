@@ -8,9 +8,8 @@ from numpy.typing import ArrayLike
 from tomopose.calibration.model.problem import STILL_MM, STILL_RAD, travel
 from tomopose.calibration.result import Calibration
 from tomopose.calibration.uncertainty.propagation import field_of_view_points
-from tomopose.calibration.uncertainty.trajectory import scatter_variance, shared_variance
+from tomopose.calibration.uncertainty.trajectory import scan_jacobian, scatter_variance
 from tomopose.errors import InputError
-from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import ProjectionMatrices, eq5_matrices
 from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 from tomopose.geometry.transforms import RigidTransform
@@ -22,20 +21,20 @@ from tomopose.values import require_types
 SCANNER_TOLERANCE = 1e-9
 
 
-def _require_same_pivot(calibration: Calibration, poses: PoseSequence) -> None:
-    if calibration.pivot is None or poses.pivot is None:
+def _require_same_pivot(calibrated: Array | None, scanned: Array | None) -> None:
+    if calibrated is None or scanned is None:
         return
-    off = np.abs(np.asarray(poses.pivot) - calibration.pivot).max()
+    off = np.abs(np.asarray(scanned) - calibrated).max()
     if off > PIVOT_TOLERANCE_MM:
         raise InputError(
-            f"the scan's pivot {np.asarray(poses.pivot)} mm is not the calibration's {calibration.pivot} mm (off by "
+            f"the scan's pivot {np.asarray(scanned)} mm is not the calibration's {calibrated} mm (off by "
             f"{off:.6g} mm): a scan about another pivot would be wrong by (1 - R) times that; set the calibration's "
             "pivot or calibrate again"
         )
 
 
-def _require_what_was_calibrated(calibration: Calibration, poses: PoseSequence) -> None:
-    if calibration.arrangement != "turntable":
+def _require_what_was_calibrated(arrangement: str, poses: PoseSequence) -> None:
+    if arrangement != "turntable":
         return
     shifted, turned = travel(poses.T_MH.R, poses.T_MH.t)
     if turned > STILL_RAD or shifted > STILL_MM:
@@ -62,18 +61,6 @@ def require_same_scanner(calibration: Calibration, scanner: Scanner) -> None:
                 f"the scanner differs from the calibration's: {name} is {b:.9g}, not {a:.9g}; matrices hold only for "
                 "the scanner that was calibrated"
             )
-
-
-def _point_sigma(
-    calibration: Calibration, commanded: PoseSequence, poses: PoseSequence, x_M: Array
-) -> tuple[Array, Array]:
-    """(n, m) px of points x_M (m, 3): in the single view, and the part that all views share.
-
-    Both are what a volume sees: a rigid pose of the object, on which no measurement depends, is taken out.
-    """
-    shared = np.sqrt(np.maximum(np.mean(shared_variance(calibration, commanded, x_M), axis=2), 0.0))
-    own = np.mean(scatter_variance(calibration, poses, x_M), axis=2)
-    return np.sqrt(shared**2 + own), shared
 
 
 @require_types
@@ -107,25 +94,26 @@ def projection_matrices(
     ------
     InputError  another pivot or scanner than the calibration's.
     """
-    _require_same_pivot(calibration, poses)
-    _require_what_was_calibrated(calibration, poses)
+    _require_same_pivot(calibration.pivot, poses.pivot)
+    _require_what_was_calibrated(calibration.arrangement, poses)
     if scanner is not None:
         require_same_scanner(calibration, scanner)
-    commanded = poses
-    poses = corrected_poses(calibration.errors, poses)
-    own = calibration.scanner
-    alpha = poses.alpha
-    T_0 = RigidTransform.identity(Frame.M, Frame.H) if home is None else home.require(Frame.M, Frame.H)
-    to_W = own.T_TW(0.0) @ calibration.T_HT @ T_0
-    P = eq5_matrices(own, T_HT=calibration.T_HT, T_MH=poses.T_MH, alpha=alpha, home=T_0)
-    if points is not None:
-        x_M = to_W.inv.apply(np.asarray(points, dtype=np.float64))
-    elif (P[:, 2, 3] > 0).all():
-        x_M = to_W.inv.apply(field_of_view_points(own))
-    else:  # at this home the field of view holds another part of the world than in the scan
-        first = own.T_TW(float(alpha[0])) @ calibration.T_HT @ poses.T_MH[0]
-        x_M = first.inv.apply(field_of_view_points(own))
-    sigma, shared = _point_sigma(calibration, commanded, poses, x_M)
+    own, real = calibration.scanner, corrected_poses(calibration.errors, poses)
+    P = eq5_matrices(own, T_HT=calibration.T_HT, T_MH=real.T_MH, alpha=poses.alpha, home=home)
+    # the plate in W at home, by which the points of the object are known
+    T_HW = own.T_TW(0.0).matrix @ calibration.T_HT.matrix
+    T_MW = T_HW if home is None else T_HW @ home.matrix
+    x_W = field_of_view_points(own) if points is None else np.asarray(points, dtype=np.float64)
+    seen_at = T_MW
+    if points is None and not (P[:, 2, 3] > 0).all():
+        # at this home the field of view holds another part of the world than in the scan
+        seen_at = own.T_TW(float(poses.alpha[0])).matrix @ calibration.T_HT.matrix @ real.T_MH[0].matrix
+    x_M = (x_W - seen_at[:3, 3]) @ seen_at[:3, :3]
+    J, C = scan_jacobian(calibration, poses, x_M)
+    # both are what a volume sees: a rigid pose of the object, on which no measurement depends, is taken out
+    shared = np.mean(np.einsum("nmic,cd,nmid->nmi", J, C, J, optimize=True), axis=2)
+    scatter = np.mean(scatter_variance(calibration, real, x_M), axis=2)
+    ball = np.mean(list(calibration.balls.values()), axis=0)
     matrices = ProjectionMatrices(
         P=P,
         n_u=own.n_u,
@@ -133,9 +121,9 @@ def projection_matrices(
         p_u=own.p_u,
         p_v=own.p_v,
         pose_id=poses.pose_id,
-        points_sigma=sigma,
-        points_sigma_shared=shared,
+        points_sigma=np.sqrt(np.maximum(shared, 0.0) + scatter),
+        points_sigma_shared=np.sqrt(np.maximum(shared, 0.0)),
         scanner=own,
-        in_front=to_W.apply(np.mean(list(calibration.balls.values()), axis=0)),
+        in_front=T_MW[:3, :3] @ ball + T_MW[:3, 3],
     )
     return matrices if binning == 1 else matrices.binned(binning)

@@ -67,25 +67,18 @@ def object_motion(
     T_MH: RigidTransform,
     alpha: Array | float = 0.0,
     home: RigidTransform | None = None,
-) -> RigidTransform:
-    """The motions (n) of the object from home to each pose, W -> W: the chain of eq. (5) without the scanner.
+) -> Array:
+    """The motions (n, 4, 4) of the object from home to each pose, W -> W: the chain of eq. (5) without the scanner.
 
     Home is table angle 0 and manipulator at zero, so that x_W0 = home x_M; the printed T_HT^-1 of eq. (5) denotes
     the inverse of (T_TW,0 T_HT T_MH,0) with two identities.  home: another T_MH,0, such as a robot's working pose,
     whose zero is far from the scanner.
     """
-    T_HT, T_MH = T_HT.require(Frame.H, Frame.T), T_MH.require(Frame.M, Frame.H)
-    n = len(T_MH)
-    T_TW = scanner.T_TW(np.broadcast_to(np.asarray(alpha, dtype=np.float64), (n,)))
-    T_HT_n = RigidTransform(
-        R=np.broadcast_to(T_HT.R, (n, 3, 3)), t=np.broadcast_to(T_HT.t, (n, 3)), source=Frame.H, target=Frame.T
-    )
-    T_MH_0 = RigidTransform.identity(Frame.M, Frame.H) if home is None else home.require(Frame.M, Frame.H)
-    home = scanner.T_TW(0.0) @ T_HT @ T_MH_0
-    home_inv = RigidTransform(
-        R=np.broadcast_to(home.inv.R, (n, 3, 3)), t=np.broadcast_to(home.inv.t, (n, 3)), source=Frame.W, target=Frame.M
-    )
-    return T_TW @ T_HT_n @ T_MH @ home_inv
+    HT, MH = T_HT.require(Frame.H, Frame.T).matrix, T_MH.require(Frame.M, Frame.H).matrix
+    at_home = np.eye(4) if home is None else home.require(Frame.M, Frame.H).matrix
+    T_TW = scanner.T_TW(np.broadcast_to(np.asarray(alpha, dtype=np.float64), (len(MH),)))
+    motion: Array = T_TW.matrix @ HT @ MH @ np.linalg.inv(scanner.T_TW(0.0).matrix @ HT @ at_home)
+    return motion
 
 
 def eq5_matrices(
@@ -101,7 +94,7 @@ def eq5_matrices(
     home: as in `object_motion`.  |P[2, :3]| = 1 and w is the depth in mm.
     """
     motion = object_motion(scanner, T_HT=T_HT, T_MH=T_MH, alpha=alpha, home=home)
-    return scanner.P_S @ (scanner.T_WS.matrix @ motion.matrix)
+    return scanner.P_S @ (scanner.T_WS.matrix @ motion)
 
 
 def canonical(P: ArrayLike, in_front: ArrayLike = (0.0, 0.0, 0.0)) -> Array:

@@ -221,14 +221,19 @@ def _project_all(
     t_k: Array,
     t: Array,
     alpha: Array,
-    found: tuple[Array, Array, Array, Array, Array, Array],
+    found: tuple[Array, Array, Array, Array, Array, Array, Array],
 ) -> None:
-    """found: x (n, 2), x_H, y_T (n, 3), G_H, G_T (n, 2, 3), J_s (n, 2, 13) of `Projected`, of every pose."""
-    x, x_H, y_T, G_H, G_T, J_s = found
+    """found: x (n, 2), x_H, y_T (n, 3), G_H, G_T (n, 2, 3), J_s (n, 2, 13) of `Projected`, of every pose, and
+    J_w (n, 2, 3) = y_T x G_T, by a turn of the mount."""
+    x, x_H, y_T, G_H, G_T, J_s, J_w = found
     R, M = np.empty((3, 3)), np.empty((3, 3))
     for k in range(R_k.shape[0]):
         out = Projected(x[k], x_H[k], y_T[k], G_H[k], G_T[k], J_s[k], R, M)
         project_pose(s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[k], alpha[k], YES, out)
+        for i in range(2):
+            for j in range(3):
+                a, b = (j + 1) % 3, (j + 2) % 3
+                J_w[k, i, j] = y_T[k, a] * G_T[k, i, b] - y_T[k, b] * G_T[k, i, a]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -296,10 +301,10 @@ def projection_blocks(
     index = np.zeros(n, dtype=np.int64) if run is None else np.array(run, dtype=np.int64)
     # written into arrays that are made here: those that compiled code makes are slow to take over
     x, x_H, y_T = np.full((n, 2), np.nan), np.empty((n, 3)), np.empty((n, 3))
-    G_H, G_T, J_s = np.zeros((n, 2, 3)), np.zeros((n, 2, 3)), np.zeros((n, 2, 13))
-    _project_all(s, index, R_HT, t_HT, R_MH, t_MH, t_k, angle, (x, x_H, y_T, G_H, G_T, J_s))
+    G_H, G_T, J_w, J_s = np.zeros((n, 2, 3)), np.zeros((n, 2, 3)), np.zeros((n, 2, 3)), np.zeros((n, 2, 13))
+    _project_all(s, index, R_HT, t_HT, R_MH, t_MH, t_k, angle, (x, x_H, y_T, G_H, G_T, J_s, J_w))
     return ProjectionBlocks(
-        x_D=x, J_w_HT=-G_T @ skew(y_T), J_t_HT=G_T, J_t=G_H @ R_MH, J_scanner=J_s, x_H=x_H, t=t_k, R_MH=R_MH, G_H=G_H
+        x_D=x, J_w_HT=J_w, J_t_HT=G_T, J_t=G_H @ R_MH, J_scanner=J_s, x_H=x_H, t=t_k, R_MH=R_MH, G_H=G_H
     )
 
 

@@ -19,7 +19,7 @@ from tomopose.calibration.model.assumed import (
     WOBBLE_RAD,
 )
 from tomopose.calibration.model.ball_projection import ProjectionBlocks
-from tomopose.geometry.rotations import R_z, log_rotation, skew
+from tomopose.geometry.rotations import R_z, log_rotation
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
 from tomopose.values import value
@@ -107,8 +107,8 @@ def unseen_columns(
     M = R_z(alpha)
     G_W = b.J_t_HT @ np.swapaxes(M, 1, 2)
     x_W = np.einsum("nij,nj->ni", M, b.x_H @ T_HT.R.T + T_HT.t)
-    by_turn = -b.G_H @ skew(b.x_H if about_H else b.x_H - origin)
-    by_tilt = -G_W @ skew(x_W)
+    by_turn = np.cross((b.x_H if about_H else b.x_H - origin)[:, None], b.G_H)
+    by_tilt = np.cross(x_W[:, None], G_W)
     w = turns(b.R_MH)
     columns = []
     for name in names:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tomopose.errors import InputError, OutOfReachError
+from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import eq5_matrices, object_motion, project
 from tomopose.geometry.rotations import rotation_from_convention
 from tomopose.geometry.scanner import Scanner
@@ -90,7 +91,7 @@ def allowed(machine: Machine, part: Part, q: Array, *, margin: float) -> np.ndar
 def _motions(machine: Machine, q: Array) -> tuple[RigidTransform, RigidTransform]:
     """(part at home in W -> W, table -> W) of axes (n, 7)."""
     moved = object_motion(machine.scanner, T_HT=machine.T_HT, T_MH=machine.poses(q).T_MH, alpha=q[:, 6])
-    return moved, machine.scanner.T_TW(q[:, 6])
+    return RigidTransform.from_matrix(moved, source=Frame.W, target=Frame.W), machine.scanner.T_TW(q[:, 6])
 
 
 def tilted(machine: Machine, alpha: Array, tilt: Array, lift: Array, centre: Array) -> Array:
