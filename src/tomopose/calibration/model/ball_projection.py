@@ -105,7 +105,7 @@ class Projected(NamedTuple):
     M: Array
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def project_pose(
     s: Array,
     R_HT: Array,
@@ -170,7 +170,7 @@ def project_pose(
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _by_panel_angles(
     theta: float, R: Array, x_S: Three, su: Three, sv: Three, u: Two, v: Two, J_s: Array
 ) -> None:  # fmt: skip
@@ -193,7 +193,7 @@ def _by_panel_angles(
         J_s[1, 6 + k] = sv[0] * c0 + sv[1] * c1 + sv[2] * c2 + v[0] * (r2 * v[1] - r1)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _by_table_axis(tilt_x: float, z: Three, m: Three, wu: Three, wv: Three, G_T: Array, J_s: Array) -> None:
     """Columns axis_y, axis_tilt_x, axis_tilt_y of J_s: x_W = M z + o with o = (0, axis_y, 0), z = x_T - o, m = M z.
 
@@ -211,7 +211,7 @@ def _by_table_axis(tilt_x: float, z: Three, m: Three, wu: Three, wv: Three, G_T:
         J_s[1, 10 + k] = wv[0] * p0 + wv[1] * p1 + wv[2] * p2 - G_T[1, 0] * q0 - G_T[1, 1] * q1 - G_T[1, 2] * q2
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _project_all(
     s: Array,
     run: Any,
@@ -221,19 +221,46 @@ def _project_all(
     t_k: Array,
     t: Array,
     alpha: Array,
-    found: tuple[Array, Array, Array, Array, Array, Array, Array],
+    derivatives: bool,
+    found: Projected,
+    J_w: Array,
 ) -> None:
-    """found: x (n, 2), x_H, y_T (n, 3), G_H, G_T (n, 2, 3), J_s (n, 2, 13) of `Projected`, of every pose, and
-    J_w (n, 2, 3) = y_T x G_T, by a turn of the mount."""
-    x, x_H, y_T, G_H, G_T, J_s, J_w = found
-    R, M = np.empty((3, 3)), np.empty((3, 3))
+    """found: x (n, 2), x_H, y_T (n, 3), G_H, G_T (n, 2, 3), J_s (n, 2, 13) of every pose, R, M (3, 3); J_w (n, 2, 3) =
+    y_T x G_T, by a turn of the mount.
+
+    Without `derivatives` one row of each array but x is enough.
+    """
+    x, x_H, y_T, G_H, G_T, J_s, R, M = found
     for k in range(R_k.shape[0]):
-        out = Projected(x[k], x_H[k], y_T[k], G_H[k], G_T[k], J_s[k], R, M)
-        project_pose(s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[k], alpha[k], YES, out)
-        for i in range(2):
-            for j in range(3):
-                a, b = (j + 1) % 3, (j + 2) % 3
-                J_w[k, i, j] = y_T[k, a] * G_T[k, i, b] - y_T[k, b] * G_T[k, i, a]
+        i = k if derivatives else 0
+        out = Projected(x[k], x_H[i], y_T[i], G_H[i], G_T[i], J_s[i], R, M)
+        project_pose(s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[k], alpha[k], derivatives, out)
+        for m in range(6 if derivatives else 0):
+            e, j, a, b = m // 3, m % 3, (m + 1) % 3, (m + 2) % 3
+            J_w[k, e, j] = y_T[i, a] * G_T[i, e, b] - y_T[i, b] * G_T[i, e, a]
+
+
+def _space(n: int) -> Projected:
+    """Arrays that `_project_all` writes n poses into: those that compiled code makes are slow to take over."""
+    return Projected(
+        x=np.full((n, 2), np.nan), x_H=np.empty((n, 3)), y_T=np.empty((n, 3)), G_H=np.zeros((n, 2, 3)),
+        G_T=np.zeros((n, 2, 3)), J_s=np.zeros((n, 2, 13)), R=np.empty((3, 3)), M=np.empty((3, 3)),
+    )  # fmt: skip
+
+
+def projected_centres(
+    s: Array, run: Any, R_HT: Array, t_HT: Array, R_MH: Array, t_MH: Array, t: Array, alpha: Array
+) -> Array:
+    """(n, 2) px: eq. (6) without derivatives; NaN where a ball is behind the source.
+
+    s (runs, 13): `scanner_vector` of each run;  run: (n,) integers;  R_HT (3, 3), t_HT (3,);  R_MH (n, 3, 3), t_MH (n,
+    3): the poses;  t: (n, 3) ball centres in M, mm;  alpha: (n,) rad.
+    """
+    found = _space(1)._replace(x=np.full((len(R_MH), 2), np.nan))
+    given = (R_HT, t_HT, R_MH, t_MH, t, alpha)
+    R_HT, t_HT, R_MH, t_MH, t, alpha = (np.ascontiguousarray(v, dtype=np.float64) for v in given)
+    _project_all(s, run, R_HT, t_HT, R_MH, t_MH, t, alpha, NO, found, np.empty((1, 2, 3)))
+    return found.x
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -299,13 +326,12 @@ def projection_blocks(
     # Copies: contiguous and writable, whatever was given, so that the kernel is compiled for one kind of array.
     R_HT, t_HT, R_MH, t_MH, t_k, angle = (np.array(x, dtype=np.float64, order="C") for x in given)
     index = np.zeros(n, dtype=np.int64) if run is None else np.array(run, dtype=np.int64)
-    # written into arrays that are made here: those that compiled code makes are slow to take over
-    x, x_H, y_T = np.full((n, 2), np.nan), np.empty((n, 3)), np.empty((n, 3))
-    G_H, G_T, J_w, J_s = np.zeros((n, 2, 3)), np.zeros((n, 2, 3)), np.zeros((n, 2, 3)), np.zeros((n, 2, 13))
-    _project_all(s, index, R_HT, t_HT, R_MH, t_MH, t_k, angle, (x, x_H, y_T, G_H, G_T, J_s, J_w))
+    b, J_w = _space(n), np.zeros((n, 2, 3))
+    _project_all(s, index, R_HT, t_HT, R_MH, t_MH, t_k, angle, YES, b, J_w)
     return ProjectionBlocks(
-        x_D=x, J_w_HT=J_w, J_t_HT=G_T, J_t=G_H @ R_MH, J_scanner=J_s, x_H=x_H, t=t_k, R_MH=R_MH, G_H=G_H
-    )
+        x_D=b.x, J_w_HT=J_w, J_t_HT=b.G_T, J_t=b.G_H @ R_MH, J_scanner=b.J_s, x_H=b.x_H, t=t_k,
+        R_MH=R_MH, G_H=b.G_H,
+    )  # fmt: skip
 
 
 def whiteners(covariance: Array) -> Array:

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tomopose.calibration.model.ball_projection import ProjectionBlocks, projection_blocks
+from tomopose.calibration.model.ball_projection import ProjectionBlocks, projected_centres, projection_blocks
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, translation_scale
 from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.rigid.kernel import Freed, Point, Rows, centres, levenberg_marquardt
+from tomopose.calibration.rigid.kernel import Freed, Point, Rows, levenberg_marquardt, scanner_vectors
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.least_squares import CODES, Status
@@ -75,16 +75,14 @@ def minimise(
     delta = start.delta.copy() if isinstance(start, Fit) and len(start.delta) == len(free) else np.zeros(len(free))
     # float64 copies: the kernel overwrites them
     R, t_HT, t = (np.array(v, dtype=np.float64, order="C") for v in (R, t_HT, t))
-    m = 6 + 3 * len(t) + len(free)
-    N = np.zeros((m, m))
     at = Point(R, t_HT, t, delta)
-    chi2, code = levenberg_marquardt(rows_of(problem, weight), freed_of(problem, free), at, iterations, N)
+    chi2, code, at, N = levenberg_marquardt(rows_of(problem, weight), freed_of(problem, free), at, iterations)
     # the rounding of many steps, taken off R: the nearest rotation, to second order in its distance
     return Fit(
-        R_HT=R @ (1.5 * np.eye(3) - 0.5 * (R.T @ R)),
-        t_HT=t_HT,
-        t=t,
-        delta=delta,
+        R_HT=at.R_HT @ (1.5 * np.eye(3) - 0.5 * (at.R_HT.T @ at.R_HT)),
+        t_HT=at.t_HT,
+        t=at.t,
+        delta=at.delta,
         chi2=float(chi2),
         status=CODES[code],
         N=N,
@@ -93,9 +91,12 @@ def minimise(
 
 def residuals(problem: Problem, free: FreeParameters, fit: Fit) -> Array:
     """(n, 2) px: observed minus calculated centres; NaN where a ball would be behind the source."""
-    at = Point(np.ascontiguousarray(fit.R_HT), fit.t_HT, fit.t, fit.delta)
-    x: Array = np.full((len(problem), 2), np.nan)
-    centres(rows_of(problem), freed_of(problem, free), at, x)
+    s = problem.s_0.copy()
+    scanner_vectors(freed_of(problem, free), fit.delta, s)
+    x = projected_centres(
+        s, problem.run, fit.R_HT, fit.t_HT, problem.R_MH, problem.t_MH,
+        fit.t[problem.ball], problem.alpha,
+    )  # fmt: skip
     return np.asarray(problem.x_D - x)
 
 

@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, prange
+from numba.extending import register_jitable
 
-from tomopose.calibration.model.ball_projection import NO, YES, Projected, project_pose
+from tomopose.calibration.model.ball_projection import YES, Projected, project_pose
 from tomopose.least_squares import CODES
 from tomopose.units import Array
 
@@ -57,7 +58,7 @@ class Point(NamedTuple):
     delta: Array
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _exp_times(w: Array, R: Array, out: Array) -> None:
     """out = exp([w]_x) R by Rodrigues' formula."""
     a2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -74,10 +75,15 @@ def _exp_times(w: Array, R: Array, out: Array) -> None:
         out[2, j] = r2 + s * c2 + c * (w[0] * c1 - w[1] * c0)
 
 
-@njit(cache=True)
-def _solve_spd(N: Array, lam: float, g: Array, L: Array, step: Array) -> bool:
-    """step = (N + lam diag N)^-1 g by Cholesky; False where the matrix is not positive definite."""
+@njit(cache=True, error_model="numpy")
+def _step(N: Array, lam: float, g: Array, L: Array, step: Array) -> tuple[float, float]:
+    """step = (N + lam diag N)^-1 g by Cholesky.
+
+    Returns (what chi2 falls by in the quadratic model, step^T g, which for lam -> 0 is step^T N step); -inf and 0 where
+    the matrix is not positive definite.
+    """
     m = g.shape[0]
+    gain, length = 0.0, 0.0
     for i in range(m):
         for j in range(i + 1):
             v = N[i, j]
@@ -87,7 +93,7 @@ def _solve_spd(N: Array, lam: float, g: Array, L: Array, step: Array) -> bool:
                 v -= L[i, k] * L[j, k]
             if i == j:
                 if not v > 1e-13 * N[i, i]:
-                    return False
+                    return -np.inf, 0.0
                 L[i, i] = math.sqrt(v)
             else:
                 L[i, j] = v / L[j, j]
@@ -101,35 +107,23 @@ def _solve_spd(N: Array, lam: float, g: Array, L: Array, step: Array) -> bool:
         for k in range(i + 1, m):
             v -= L[k, i] * step[k]
         step[i] = v / L[i, i]
-    return True
+        length += step[i] * g[i]
+        gain += step[i] * (g[i] + lam * N[i, i] * step[i])
+    return gain, length
 
 
-@njit(cache=True)
-def _scanner_vectors(freed: Freed, delta: Array, s: Array) -> None:
-    s[:] = freed.s_0
-    for j in range(freed.cols.shape[0]):
-        if freed.col_run[j] < 0:
-            for r in range(s.shape[0]):
+@register_jitable
+def scanner_vectors(freed: Freed, delta: Array, s: Array) -> None:
+    """s (runs, 13): the scanner vectors with the freed parameters off their nominal values by delta (f,)."""
+    for r in range(s.shape[0]):
+        for i in range(s.shape[1]):
+            s[r, i] = freed.s_0[r, i]
+        for j in range(freed.cols.shape[0]):
+            if freed.col_run[j] < 0 or freed.col_run[j] == r:
                 s[r, freed.cols[j]] += freed.factor[j] * delta[j]
-        else:
-            s[freed.col_run[j], freed.cols[j]] += freed.factor[j] * delta[j]
 
 
-@njit(cache=True)
-def centres(rows: Rows, freed: Freed, at: Point, x: Array) -> None:
-    """x (n, 2) px: the calculated centres, without derivatives; left as it is where a ball is behind the source."""
-    R, t, alpha, run, ball = rows.R, rows.t, rows.alpha, rows.run, rows.ball
-    R_HT, t_HT, balls, _ = at
-    work = _work_space()
-    found = work.x
-    s = freed.s_0.copy()
-    _scanner_vectors(freed, at.delta, s)
-    for k in range(R.shape[0]):
-        if project_pose(s[run[k]], R_HT, t_HT, R[k], t[k], balls[ball[k]], alpha[k], NO, work):
-            x[k, 0], x[k, 1] = found[0], found[1]
-
-
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _work_space() -> Projected:
     return Projected(
         np.empty(2), np.empty(3), np.empty(3), np.empty((2, 3)), np.empty((2, 3)), np.zeros((2, 13)),
@@ -137,7 +131,7 @@ def _work_space() -> Projected:
     )  # fmt: skip
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def normal_equations(rows: Rows, s: Array, freed: Freed, at: Point, N: Array, g: Array) -> float:
     """chi2 at a point, and N = J^T J and g = J^T r there (r = observed - calculated, whitened).
 
@@ -203,69 +197,65 @@ def normal_equations(rows: Rows, s: Array, freed: Freed, at: Point, N: Array, g:
     return chi2
 
 
-@njit(cache=True)
-def _moved(at: Point, step: Array, to: Point) -> None:
-    """The point after a step, written into `to`."""
+@njit(cache=True, error_model="numpy")
+def _moved(freed: Freed, at: Point, step: Array, to: Point, s: Array) -> None:
+    """The point after a step, written into `to`, and its scanner vectors s."""
     n_b = at.t.shape[0]
-    _exp_times(step[:3], at.R_HT, to.R_HT)
+    _exp_times(step, at.R_HT, to.R_HT)
     for i in range(3):
         to.t_HT[i] = at.t_HT[i] + step[3 + i]
         for j in range(n_b):
             to.t[j, i] = at.t[j, i] + step[6 + 3 * j + i]
     for j in range(at.delta.shape[0]):
         to.delta[j] = at.delta[j] + step[6 + 3 * n_b + j]
+    scanner_vectors(freed, to.delta, s)
 
 
-@njit(cache=True)
-def levenberg_marquardt(rows: Rows, freed: Freed, at: Point, iterations: int, N: Array) -> tuple[float, int]:
-    """Minimise chi2 from the point `at`, which is overwritten by the optimum; N becomes J^T J there.
+@register_jitable
+def levenberg_marquardt(rows: Rows, freed: Freed, at: Point, iterations: int) -> tuple[float, int, Point, Array]:
+    """Minimise chi2 from the point `at`, which is overwritten.
 
-    Returns (chi2, status).
+    One solve runs it in Python, where only what loops over rows or unknowns is compiled; `solve_batch` compiles it.
+    Returns (chi2, status, the optimum, N = J^T J there).
     """
-    m = N.shape[0]
+    m = 6 + 3 * at.t.shape[0] + at.delta.shape[0]
     g, step, L = np.zeros(m), np.zeros(m), np.zeros((m, m))
-    g_new, N_new = np.zeros(m), np.zeros((m, m))
-    s = freed.s_0.copy()
+    N, g_new, N_new = np.zeros((m, m)), np.zeros(m), np.zeros((m, m))
     trial = Point(at.R_HT.copy(), at.t_HT.copy(), at.t.copy(), at.delta.copy())
-    _scanner_vectors(freed, at.delta, s)
+    s = freed.s_0.copy()
+    scanner_vectors(freed, at.delta, s)
     chi2 = normal_equations(rows, s, freed, at, N, g)
     if not chi2 < np.inf:
-        return np.inf, NO_START
+        return np.inf, NO_START, at, N
     lam, grow = 1e-4, 2.0
     for _ in range(iterations):
-        if not _solve_spd(N, lam, g, L, step):
+        gain, length = _step(N, lam, g, L, step)
+        if not gain > -np.inf:
             lam = max(lam, 1e-8) * 10.0
             if lam > 1e8:
-                return chi2, SINGULAR
+                return chi2, SINGULAR, at, N
             continue
-        length, gain = 0.0, 0.0
-        for i in range(m):
-            length += step[i] * g[i]  # for lam -> 0 this is step^T N step
-            gain += step[i] * (g[i] + lam * N[i, i] * step[i])
-        _moved(at, step, trial)
-        _scanner_vectors(freed, trial.delta, s)
+        _moved(freed, at, step, trial, s)
         chi2_new = normal_equations(rows, s, freed, trial, N_new, g_new)
         small = length < STEP_TOLERANCE * STEP_TOLERANCE
         if chi2_new < chi2 or (small and chi2_new < np.inf) or chi2_new == chi2:
             ratio = (chi2 - chi2_new) / gain if gain > 0 else 1.0
-            at.R_HT[:], at.t_HT[:], at.t[:], at.delta[:] = trial.R_HT, trial.t_HT, trial.t, trial.delta
+            at, trial, N, N_new, g, g_new = trial, at, N_new, N, g_new, g
             chi2 = chi2_new
-            N[:], g[:] = N_new, g_new
             if small and lam < 1e-3:
-                return chi2, CONVERGED
+                return chi2, CONVERGED, at, N
             cut = 1.0 - (2.0 * ratio - 1.0) ** 3
-            lam *= min(max(cut, 0.02), 1.0)
-            lam = max(lam, 1e-15)
+            lam = max(lam * min(max(cut, 0.02), 1.0), 1e-15)
             grow = 2.0
         else:
             # at the floor of rounding a step no longer lowers chi2: that is the optimum too
             if length < 1e-12 * max(chi2, 1e-6) or length < 1e-14:
-                return chi2, CONVERGED
+                return chi2, CONVERGED, at, N
             lam *= grow
             grow *= 2.0
             if lam > 1e12:
-                return chi2, STALLED
-    return chi2, OUT_OF_STEPS
+                return chi2, STALLED, at, N
+    return chi2, OUT_OF_STEPS, at, N
 
 
 @njit(cache=True)
@@ -283,16 +273,17 @@ def _solve_one(
     rows: Rows, freed: Freed, centre: Array, start: Point, iterations: int, theta: Array
 ) -> tuple[float, int]:
     """One solve from a start with the priors centred at `centre` (f,), its result written into theta (m,)."""
-    n_b, n_f, m = start.t.shape[0], centre.shape[0], theta.shape[0]
+    n_b, n_f = start.t.shape[0], centre.shape[0]
     at = Point(start.R_HT.copy(), start.t_HT.copy(), start.t.copy(), start.delta - centre)
-    s, N = freed.s_0.copy(), np.zeros((m, m))
-    _scanner_vectors(freed, centre, s)
+    s = freed.s_0.copy()
+    scanner_vectors(freed, centre, s)
     shifted = Freed(s, freed.cols, freed.col_run, freed.factor, freed.information)
-    chi2, status = levenberg_marquardt(rows, shifted, at, iterations, N)
+    chi2, status, at, _ = levenberg_marquardt(rows, shifted, at, iterations)
     _log_rotation(at.R_HT @ start.R_HT.T, theta)
-    theta[3:6] = at.t_HT
-    for j in range(n_b):
-        theta[6 + 3 * j : 9 + 3 * j] = at.t[j]
+    for i in range(3):
+        theta[3 + i] = at.t_HT[i]
+        for j in range(n_b):
+            theta[6 + 3 * j + i] = at.t[j, i]
     for j in range(n_f):
         theta[6 + 3 * n_b + j] = centre[j] + at.delta[j]
     return chi2, status
