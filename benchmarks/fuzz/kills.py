@@ -35,6 +35,7 @@ LONGEST = 0.4
 """Latest moment of a kill after both states were written once, s."""
 RESUMED = ("simulate",)
 """Verbs that write a file at a time and continue where they stopped: a next run must come to the whole result."""
+GOOD = ("old", "new", "resumed")
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
 
@@ -89,9 +90,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # a program in the bac
 write, folder = kills.WRITERS[sys.argv[2]], Path(sys.argv[3])
 try:
     for k in itertools.count():
+        print(k, file=sys.__stdout__, flush=True)
         write(folder, k % 2)
-        if k == 1:
-            print("ready", flush=True)
 except KeyboardInterrupt:
     pass
 """
@@ -120,23 +120,31 @@ def differences(found: dict[str, str], states: list[dict[str, str]]) -> list[str
     return [str(sorted(dict(found.items() ^ state.items()))[:4]) for state in states]
 
 
-def kill_once(name: str, folder: Path, rng: random.Random) -> str:
-    """One kill; "old or new", or what is wrong with what was left."""
+def kill_once(name: str, folder: Path, rng: random.Random) -> tuple[str, str]:
+    """One kill: the signal, and "old" or "new" whole, "resumed", or what is wrong with what was left."""
     states = []
     for state in (0, 1):
-        (folder / "fresh" / str(state)).mkdir(parents=True)
-        WRITERS[name](folder / "fresh" / str(state), state)
-        states.append(visible(folder / "fresh" / str(state)))
+        fresh = folder / f"fresh-{state}"  # as deep as `killed`: a result may name its inputs relative to itself
+        fresh.mkdir()
+        WRITERS[name](fresh, state)
+        states.append(visible(fresh))
     place = folder / "killed"
     place.mkdir()
     command = [sys.executable, "-c", PROGRAM, str(Path(__file__).parent), name, str(place)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as program:
         assert program.stdout is not None
-        program.stdout.readline()
+        while program.stdout.readline().strip() != b"2":  # both states were written once
+            assert program.poll() is None, "the program ended before it was killed"
         time.sleep(rng.uniform(0, LONGEST))
         number = rng.choice(SIGNALS)
         program.send_signal(number)
+        begun = [int(line) for line in program.stdout.read().split() if line.isdigit()]
         program.wait()
+    return number.name, left_by(name, place, states, number, max(begun, default=2) % 2)
+
+
+def left_by(name: str, place: Path, states: list[dict[str, str]], number: signal.Signals, writing: int) -> str:
+    """What a program left that was killed while it wrote states[writing]."""
     found = visible(place)
     if name not in RESUMED and found not in states:
         return f"a mixture: {differences(found, states)}"
@@ -148,7 +156,7 @@ def kill_once(name: str, folder: Path, rng: random.Random) -> str:
     left = sorted(p.name for p in place.rglob(".*"))
     if left or visible(place) != states[1]:
         return f"the next run left {left}, or another result: {differences(visible(place), states[1:])}"
-    return "old or new"
+    return "resumed" if found not in states else "new" if found == states[writing] else "old"
 
 
 def main() -> int:
@@ -160,14 +168,23 @@ def main() -> int:
     wanted = [name for name in WRITERS if not args.only or name in args.only.split(",")]
     prepare(INPUTS)
     rng = random.Random(args.seed)
-    found: Counter[str] = Counter()
+    found: dict[str, Counter[str]] = {name: Counter() for name in wanted}
+    signals: Counter[str] = Counter()
     for k in range(args.kills):
         name = wanted[k % len(wanted)]
         with tempfile.TemporaryDirectory() as root:
-            found[f"{name}: {kill_once(name, Path(root), rng)}"] += 1
-    for what, times in found.most_common():
-        print(f"{times:5d}  {what}")
-    return int(any(not what.endswith("old or new") for what in found))
+            number, what = kill_once(name, Path(root), rng)
+        found[name][what] += 1
+        signals[number] += 1
+        if what not in GOOD:
+            print(f"{name}, {number}: {what}", flush=True)
+    print(f"{'writer':14s} whole old  whole new    resumed  a mixture or worse")
+    found["all"] = sum(found.values(), Counter())
+    for name, count in found.items():
+        wrong = sum(n for what, n in count.items() if what not in GOOD)
+        print(f"{name:14s}{count['old']:10d}{count['new']:11d}{count['resumed']:11d}{wrong:20d}")
+    print(", ".join(f"{n} {name}" for name, n in sorted(signals.items())))
+    return int(wrong > 0)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tomopose.detection.order_statistics import median, select
+from tomopose.detection.order_statistics import arrange, median, select
 
 RNG = np.random.default_rng(4)
 SAMPLES = {
@@ -32,3 +32,10 @@ def test_selection_is_the_sorted_one(name: str) -> None:
 def test_missing_values_end_the_search() -> None:
     values = np.array([1.0, np.nan, 2.0, np.nan, np.nan])
     assert np.isnan(select(values, 4))
+
+
+@pytest.mark.parametrize("name", list(SAMPLES))
+def test_values_are_arranged_upwards(name: str) -> None:
+    values = SAMPLES[name].copy()
+    arrange(values)
+    assert np.array_equal(values, np.sort(SAMPLES[name]))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit
 
 
@@ -48,4 +47,20 @@ def median(values):  # type: ignore[no-untyped-def]
     """Median, the mean of the middle two where their number is even."""
     half = values.shape[0] // 2
     upper = select(values, half)
-    return upper if values.shape[0] % 2 == 1 else 0.5 * (np.max(values[:half]) + upper)
+    if values.shape[0] % 2 == 1:
+        return upper
+    lower = values[0]
+    for i in range(1, half):
+        lower = max(lower, values[i])
+    return 0.5 * (lower + upper)
+
+
+@njit(cache=True)
+def arrange(values):  # type: ignore[no-untyped-def]
+    """Orders a few values upwards, in place, by insertion."""
+    for i in range(1, values.shape[0]):
+        x, j = values[i], i
+        while j > 0 and values[j - 1] > x:
+            values[j] = values[j - 1]
+            j -= 1
+        values[j] = x

@@ -22,7 +22,7 @@ STILL = 0.002
 """Move, px, below which a circle counts as fitted: the rays' edges are no better than a tenth."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def check_circle(image, u, v, low, high, sign, aspect, noise, tightness, wide, rays):  # type: ignore[no-untyped-def]
     """(found, u, v, radius, complete, visible, contrast) of the circle near (u, v) with radius in [low, high].
 
@@ -69,13 +69,16 @@ def check_circle(image, u, v, low, high, sign, aspect, noise, tightness, wide, r
         low, high = max(radius - half, 1.0), radius + half
         if turn >= 2 and math.sqrt(cx * cx + cy * cy) < 0.1:
             break
-    complete = np.sum(deviation[:n] < tolerance) / max(n_seen, 1)
+    agree = 0
+    for k in range(n):
+        agree += deviation[k] < tolerance
+    complete = agree / max(n_seen, 1)
     if median(deviation[:n]) > 0.5 * tolerance:
         complete *= 0.5
     return True, u, v, radius, complete, n_seen / RAYS, _disc_contrast(image, u, v, radius, sign, aspect)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def ray_edges(image, u, v, limits, sign, aspect, wide, edge, strength, seen):  # type: ignore[no-untyped-def]
     """Fills radius and strength of the steepest edge of polarity `sign` on each ray, and whether the ray stays in the
     image long enough; returns how many do.
@@ -117,7 +120,7 @@ def ray_edges(image, u, v, limits, sign, aspect, wide, edge, strength, seen):  #
     return n_seen
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _between_pixels(image, x, y):  # type: ignore[no-untyped-def]
     """The image at (x, y), linear between pixels."""
     i, j = int(x), int(y)
@@ -127,7 +130,7 @@ def _between_pixels(image, x, y):  # type: ignore[no-untyped-def]
     return before + fy * (after - before)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _robust_circle(x, y, start):  # type: ignore[no-untyped-def]
     """(u, v, radius) through most of the points: least squares, points that disagree given less weight (Cauchy)."""
     n, cx, cy, radius = x.shape[0], 0.0, 0.0, start
@@ -167,7 +170,7 @@ def _robust_circle(x, y, start):  # type: ignore[no-untyped-def]
     return cx, cy, radius
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _disc_contrast(image, u, v, radius, sign, aspect):  # type: ignore[no-untyped-def]
     """How much darker (sign +1) the middle is than the surroundings; not positive for a ring or a hole."""
     sample, n_disc, n_around = np.empty((2, 2 * RAYS)), 0, 0
@@ -188,7 +191,7 @@ def _disc_contrast(image, u, v, radius, sign, aspect):  # type: ignore[no-untype
     return sign * (median(sample[1, :n_around]) - median(sample[0, :n_disc]))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def rim_blur(image, u, v, radius, aspect, sign):  # type: ignore[no-untyped-def]
     """Standard deviation, px, of the blur of a circle's rim, from the steepest slope of the mean profile across it.
 
@@ -203,15 +206,22 @@ def rim_blur(image, u, v, radius, aspect, sign):  # type: ignore[no-untyped-def]
             if 0.0 <= x < image.shape[1] - 1.0 and 0.0 <= y < image.shape[0] - 1.0:
                 total[q] += _between_pixels(image, x, y)
                 count[q] += 1.0
-    mean = total / np.maximum(count, 1.0)
     deep, far = int(0.3 * radius) + 1, int(1.5 * radius)
-    height = sign * (np.sum(total[far:]) / max(np.sum(count[far:]), 1.0) - np.mean(mean[:deep]))
+    inside, outside, n_outside = 0.0, 0.0, 0.0
+    for q in range(n):
+        if q >= far:
+            outside += total[q]
+            n_outside += count[q]
+        total[q] /= max(count[q], 1.0)
+        if q < deep:
+            inside += total[q]
+    height = sign * (outside / max(n_outside, 1.0) - inside / min(deep, n))
     blur, apart = 0.0, 1
     for _ in range(3):
         steepest = 0.0
         for q in range(max(int(0.5 * radius), apart), min(n - apart, int(1.5 * radius) + 3)):
             if count[q - apart] > 0.0 and count[q + apart] > 0.0:
-                steepest = max(steepest, sign * 0.5 / apart * (mean[q + apart] - mean[q - apart]))
+                steepest = max(steepest, sign * 0.5 / apart * (total[q + apart] - total[q - apart]))
         if not (steepest > 0.0 and height > 0.0):
             return blur
         blur = height / (math.sqrt(2.0 * math.pi) * steepest)

@@ -117,8 +117,7 @@ def _without_outliers(s, image, value, clear, least, weight):  # type: ignore[no
             size[m] = abs(image[i] - value[i])
             m += 1
     most = max(8 * MAD_TO_SIGMA * median(size[:m]), least) if m > 0 else np.inf
-    out = np.full(s.shape[0], weight)
+    out = np.empty(s.shape[0])
     for i in range(s.shape[0]):
-        if abs(s[i]) > clear and abs(image[i] - value[i]) > most:
-            out[i] = 0.0
+        out[i] = 0.0 if abs(s[i]) > clear and abs(image[i] - value[i]) > most else weight
     return out

@@ -11,7 +11,7 @@ from numba import njit
 from scipy.ndimage import convolve
 
 from tomopose.coverage import NORMAL_MEDIAN
-from tomopose.detection.order_statistics import median, select
+from tomopose.detection.order_statistics import arrange, median, select
 from tomopose.detection.rim_fit.state import Noise, RimFit
 from tomopose.detection.rim_model.ring import SHELLS
 from tomopose.detection.settings import NoiseSettings
@@ -47,9 +47,11 @@ def _weights(s, residual, model, first, stand, parameters, outlier, clipped, kep
     """
     sigma, level, white, floor = stand
     n, k = s.shape[0], first.shape[0] - 1
-    square = residual * residual
-    limit, part = np.zeros(k), np.empty(n)
+    square, used, part, weight = np.empty(n), np.empty(n), np.empty(n), np.zeros(n)
+    limit, mean, level_of, count = np.zeros(k), np.zeros(k), np.zeros(k), np.zeros(k)
     largest, n_rim = 0.0, 0
+    for i in range(n):
+        square[i] = residual[i] * residual[i]
     for j in range(k):
         m = 0
         for i in range(first[j], first[j + 1]):
@@ -63,8 +65,6 @@ def _weights(s, residual, model, first, stand, parameters, outlier, clipped, kep
         part[n_rim] = square[i]
         n_rim += abs(s[i]) <= 3 * sigma
     rim_limit = outlier**2 * median(part[:n_rim]) / NORMAL_MEDIAN if n_rim > 0 else 0.0
-    used = np.empty(n)
-    mean, level_of, count = np.zeros(k), np.zeros(k), np.zeros(k)
     n_core, n_inner, core, inner, core_level, inner_level = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(k):
         on_rim, within = max(limit[j], rim_limit), max(limit[j], outlier**2 * floor)
@@ -83,47 +83,61 @@ def _weights(s, residual, model, first, stand, parameters, outlier, clipped, kep
             n_core += at_core
             core += at_core * square[i]
             core_level += at_core * model[i]
-    enough = count > 2 * parameters + 2
-    if not np.any(enough):
-        return np.zeros(n), np.nan, np.nan, mean, 1.0
+    fewest, m = 2 * parameters + 2, 0
+    for j in range(k):
+        if count[j] > fewest:
+            mean[j] /= max(count[j] - parameters, 1.0)
+            part[m] = mean[j]
+            m += 1
+    if m == 0:
+        return weight, np.nan, np.nan, mean, 1.0
+    usual = select(part[:m], m // 4)
     if n_core <= 20:
         n_core, core, core_level = n_inner, inner, inner_level
-    mean = mean / np.maximum(count - parameters, 1.0)
-    v_in, level_in = (core / n_core, core_level / n_core) if n_core > 0 else (median(mean[enough]), white)
+    v_in, level_in = (core / n_core, core_level / n_core) if n_core > 0 else (median(part[:m]), white)
     v_in = max(v_in, floor)
-    share = (level_of / np.maximum(count, 1.0) - level_in) / (level - level_in)
-    usual = select(mean[enough], np.sum(enough) // 4)
     # What a sector's variance would be at the mean level of the background.
+    m = 0
     for j in range(k):
-        mean[j] /= min(max((v_in + (usual - v_in) * share[j]) / max(usual, 1e-300), 0.5), 2.0)
-    v_out, spread = _quiet(mean[enough], median(count[enough]), clipped, kept_below)
+        if count[j] > fewest:
+            share = (level_of[j] / max(count[j], 1.0) - level_in) / (level - level_in)
+            part[m] = mean[j] / min(max((v_in + (usual - v_in) * share) / max(usual, 1e-300), 0.5), 2.0)
+            limit[m] = count[j]
+            m += 1
+    v_out, spread = _quiet(part[:m], median(limit[:m]), clipped, kept_below)
     v_out = max(v_out, floor)
-    weight, chi2 = np.empty(n), np.zeros(k)
     per_level = 1.0 / (level - level_in)
     for j in range(k):
+        chi2 = 0.0
         for i in range(first[j], first[j + 1]):
             x = min(max((model[i] - level_in) * per_level, 0.0), 1.3)
             weight[i] = used[i] / max(v_in + (v_out - v_in) * x, min(v_in, v_out))
-            chi2[j] += square[i] * (weight[i] if s[i] > 3 * sigma else 0.0)
-        chi2[j] = chi2[j] / max(count[j] - parameters, 1.0) - 1.0 if enough[j] else 0.0
-    return weight, v_in, v_out, chi2, spread
+            chi2 += square[i] * (weight[i] if s[i] > 3 * sigma else 0.0)
+        mean[j] = chi2 / max(count[j] - parameters, 1.0) - 1.0 if count[j] > fewest else 0.0
+    return weight, v_in, v_out, mean, spread
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _quiet(variance, n, clipped, kept_below):  # type: ignore[no-untyped-def]
-    """(mean, relative spread) of the sectors' variances that belong together at their low end.
+    """(mean, relative spread) of the sectors' variances that belong together at their low end; orders them.
 
     n: pixels of a sector.  A holder's edges add to a sector's variance; only a clipped background takes some away.
     """
-    ordered = np.sort(variance)
-    ordered = ordered[ordered > clipped * ordered[ordered.shape[0] // 4]]
-    m = ordered.shape[0]
-    low, quarter = ordered[m // 10], ordered[m // 4]
+    arrange(variance)
+    m = variance.shape[0]
+    least, first = clipped * variance[m // 4], 0
+    while variance[first] <= least and first < m - 1:
+        first += 1
+    m -= first
+    low, quarter = variance[first + m // 10], variance[first + m // 4]
     spread = max(math.sqrt(2.0 / n), min((quarter - low) / (0.607 * max(quarter, 1e-300)), 0.5))
     middle = quarter * (1.0 + 0.67 * spread)
     for _ in range(4):
-        kept = ordered[ordered < middle * (1.0 + kept_below * spread)]
-        middle = np.mean(kept) * (1.0 + SHORT * spread)
+        total, kept, most = 0.0, 0, middle * (1.0 + kept_below * spread)
+        while kept < m and variance[first + kept] < most:
+            total += variance[first + kept]
+            kept += 1
+        middle = total / kept * (1.0 + SHORT * spread)
     return middle, spread
 
 

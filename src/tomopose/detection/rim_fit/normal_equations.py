@@ -140,15 +140,12 @@ def _gradient(image, value, jacobian, first, weight, columns, high):  # type: ig
     """g alone, of the shells before `high`."""
     k = (first.shape[0] - 1) // SHELLS
     g = np.zeros(FIRST_NODE + 3 * k)
-    residual = weight * (image - value)
     for node in range(k):
         start, stop = first[node * SHELLS], first[node * SHELLS + high]
-        y = residual[start:stop]
         for p in columns:
-            a = jacobian[p, start:stop]
             total = 0.0
-            for i in range(stop - start):
-                total += a[i] * y[i]
+            for i in range(start, stop):
+                total += jacobian[p, i] * (weight[i] * (image[i] - value[i]))
             g[_place(p, node, k)] += total
     return g
 
@@ -164,7 +161,9 @@ def _with_priors(N, g, active, shape, white, nodes, kappa, log_radius, white_pri
     pull[2] = precision[2] * shape[2] * (log_radius[0] - math.log(shape[2]))
     precision[WHITE] = white_prior[1]
     pull[WHITE] = white_prior[1] * (white_prior[0] - white)
-    level = np.mean(nodes[:, 0])
+    level = 0.0
+    for j in range(nodes.shape[0]):
+        level += nodes[j, 0] / nodes.shape[0]
     for j in range(nodes.shape[0]):
         for c in range(3):
             i = FIRST_NODE + 3 * j + c

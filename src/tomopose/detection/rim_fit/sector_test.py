@@ -21,6 +21,7 @@ import numpy as np
 from numba import njit
 
 from tomopose.detection.cholesky import solve
+from tomopose.detection.order_statistics import select
 from tomopose.detection.rim_fit.noise import excess_variance
 from tomopose.detection.rim_fit.normal_equations import Equations, summed, with_priors
 from tomopose.detection.rim_fit.state import RimFit, active_parameters
@@ -77,28 +78,32 @@ def kept_weight(s, sector, share, normalised, k, cells, parameters, noise):  # t
     most, so that correlated noise is not a sector's fault; no more than `noise`.
     """
     height, parts, rare = cells
-    rings = 1 + int(np.max(s) / height)
+    farthest = 0.0
+    for i in range(s.shape[0]):
+        farthest = max(farthest, s[i])
+    rings = 1 + int(farthest / height)
     total, count = np.zeros((k, rings * parts)), np.zeros((k, rings * parts))
     for i in range(s.shape[0]):
         if s[i] > 0.0 and normalised[i] != 0.0:
             cell = int(s[i] / height) * parts + min(int(share[i] * parts), parts - 1)
             total[sector[i], cell] += normalised[i]
             count[sector[i], cell] += 1.0
-    freedom, square = np.full(k, -parameters), np.zeros(k)
+    freedom, square, ordered, kept, m = np.empty(k), np.empty(k), np.empty(k), np.ones(k), 0
     for j in range(k):
+        freedom[j], square[j] = -parameters, 0.0
         for cell in range(rings * parts):
             if count[j, cell] > 1.0:
                 square[j] += total[j, cell] ** 2 / count[j, cell]
                 freedom[j] += 1.0
-    enough = freedom > 2.0
-    kept = np.ones(k)
-    if not np.any(enough):
+        square[j] /= max(freedom[j], 1.0)
+        if freedom[j] > 2.0:
+            ordered[m] = square[j]
+            m += 1
+    if m == 0:
         return kept
-    square /= np.maximum(freedom, 1.0)
-    ordered = np.sort(square[enough])
-    usual = min(max(1.0, float(ordered[ordered.shape[0] // 3])), noise)
+    usual = min(max(1.0, select(ordered[:m], m // 3)), noise)
     for j in range(k):
-        if enough[j]:
+        if freedom[j] > 2.0:
             kept[j] = 1.0 / excess_variance(square[j] / usual, freedom[j], rare)
     return kept
 
