@@ -10,6 +10,7 @@ each cell holds the quadratic surface nearest to the transmission (`cells`), so 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -35,9 +36,8 @@ from tomopose.simulation.projector.sampling import (
     BLOCK,
     KernelScene,
     WorkSpace,
-    all_corners,
     at,
-    coarse_corners,
+    corners,
     kernel_scene,
     lengths,
     work_space,
@@ -67,7 +67,7 @@ def _crossing(c: KernelScene, work: WorkSpace, u_0: float, v_0: float, u_1: floa
     return 0.5 * (lo + hi)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _split_cell(
     c: KernelScene, work: WorkSpace, left: float, low: float, h: float, along_u: bool, marks: Arrays, M: np.ndarray
 ) -> None:
@@ -110,7 +110,7 @@ def _split_cell(
                     gather_value(M, value, a, b)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _nodes(
     c: KernelScene,
     work: WorkSpace,
@@ -147,7 +147,7 @@ def _edge_runs(m: np.ndarray, along_u: bool) -> Any:
     return along_u, (m[0, 0], m[0, 1], m[1, 0], m[1, 1]) if along_u else (m[0, 0], m[1, 0], m[0, 1], m[1, 1])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _cell(
     c: KernelScene,
     work: WorkSpace,
@@ -191,14 +191,16 @@ def _cell(
         x, y = points[q]
         value, _ = at(c, work, left + (x + 0.5) * h, low + (y + 0.5) * h)
         gather_value(M, value / n, x, y)
-    xy = (points[:, 0] * points[:, 1]).mean()
+    xy = 0.0
+    for q in range(n):
+        xy += points[q, 0] * points[q, 1] / n
     add_moments(out, row, column, weight, f, M, xy, (1 - 1 / n**2) / 12)
 
 
 @njit(cache=True, nogil=True)
 def _cells(
     c: KernelScene,
-    depth: int,
+    work: WorkSpace,
     u_0: int,
     v_0: int,
     I: np.ndarray,
@@ -207,16 +209,16 @@ def _cells(
     j_0: int,
     j_1: int,
     weight: float,
-    out: np.ndarray,
     rough: np.ndarray,
+    out: np.ndarray,
 ) -> None:
-    """Add weight x moments of the f x f cells of the pixels in rows j_0 to j_1 to `out` (HELD, rows, columns)."""
-    work = work_space(c, depth)
+    """Add weight x moments of the f x f cells of the rough pixels in rows j_0 to j_1 to `out` (HELD, rows, columns)."""
     node, node_seen = np.empty((f + 1, f + 1)), np.empty((f + 1, f + 1), dtype=np.int64)
     h, M, bow = 1.0 / f, np.empty(HELD), bows(f)
-    fill_smooth(I, seen, f, j_0, j_1, weight, out, rough)
-    for j, i in np.argwhere(rough[j_0:j_1]):
-        j += j_0
+    for number in range(j_0 * rough.shape[1], j_1 * rough.shape[1]):
+        j, i = number // rough.shape[1], number % rough.shape[1]
+        if not rough[j, i]:
+            continue
         left, low = u_0 + i - 0.5, v_0 + j - 0.5
         f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
         mark = seen[j, i]
@@ -266,18 +268,28 @@ def add_transmission(
         j = slice(max(int(np.floor(v_lo)) - window.v_0, 0), max(int(np.ceil(v_hi)) - window.v_0 + 2, 0))
         i = slice(max(int(np.floor(u_lo)) - window.u_0, 0), max(int(np.ceil(u_hi)) - window.u_0 + 2, 0))
         mask[j, i] = True
-    common = (c, compiled.depth, window.u_0, window.v_0)
-    fine = [True]
     shape = (window.n_v // BLOCK + 1, window.n_u // BLOCK + 1) if _without_small_parts(compiled, boxes) else (0, 0)
     rough_I, rough_seen = np.empty(shape), np.empty(shape, dtype=np.int64)
-    in_bands(lambda lo, hi: coarse_corners(*common, mask, lo, hi, rough_I, rough_seen), shape[0], threads)
+    none_I, none_seen = np.empty((0, 0)), np.empty((0, 0), dtype=np.int64)
+    fine = [True]
 
-    def corners(lo: int, hi: int) -> None:
-        if not all_corners(*common, mask, rough_I, rough_seen, lo, hi, I, seen):
-            fine[0] = False
+    def rays(step: int, known: tuple[Array, np.ndarray], found: tuple[Array, np.ndarray]) -> Callable[[int, int], None]:
+        def band(lo: int, hi: int) -> None:
+            work = work_space(c, compiled.depth)
+            if not corners(c, work, window.u_0, window.v_0, step, mask, *known, lo, hi, *found):
+                fine[0] = False
 
-    in_bands(corners, window.n_v + 1, threads)
+        return band
+
+    in_bands(rays(BLOCK, (none_I, none_seen), (rough_I, rough_seen)), shape[0], threads)
+    in_bands(rays(1, (rough_I, rough_seen), (I, seen)), window.n_v + 1, threads)
     if not fine[0]:
         raise InputError(f"a ray crosses more than {LARGEST} surfaces of one solid; split the solid in several")
     rough = np.empty((window.n_v, window.n_u), dtype=np.bool_)
-    in_bands(lambda lo, hi: _cells(*common, I, seen, f, lo, hi, weight, out, rough), window.n_v, threads)
+
+    def cells(lo: int, hi: int) -> None:
+        fill_smooth(I, seen, f, lo, hi, weight, out, rough)
+        work = work_space(c, compiled.depth)
+        _cells(c, work, window.u_0, window.v_0, I, seen, f, lo, hi, weight, rough, out)
+
+    in_bands(cells, window.n_v, threads)

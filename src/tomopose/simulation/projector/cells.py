@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from tomopose.units import Array
 
@@ -75,7 +76,7 @@ def add_moments(
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _smooth(I: np.ndarray, seen: np.ndarray, j: int, i: int) -> bool:
     """Whether the pixel with lower corner (j, i) and its eight neighbours see the same surfaces, and no third
     difference between them exceeds `most`."""
@@ -97,7 +98,7 @@ def _smooth(I: np.ndarray, seen: np.ndarray, j: int, i: int) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@register_jitable
 def bows(f: int) -> Any:
     """Mean over cell b of x (1 - x) / 2: what bilinear interpolation between the corners misses per unit of
     curvature."""
@@ -160,7 +161,9 @@ def fill_smooth(
             if rough[j, i]:
                 continue
             if seen[j, i] == 0:
-                out[0, j * f : (j + 1) * f, i * f : (i + 1) * f] += weight
+                for a in range(f):
+                    for b in range(f):
+                        out[0, j * f + a, i * f + b] += weight
                 continue
             f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
             I_uu = 0.25 * (I[j, i - 1] - f_00 - f_01 + I[j, i + 2] + I[j + 1, i - 1] - f_10 - f_11 + I[j + 1, i + 2])

@@ -169,7 +169,7 @@ def _combine(T: np.ndarray, S: np.ndarray, a: int, na: int, b: int, nb: int, op:
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _solid_crossings(
     s: SolidArrays,
     k: int,
@@ -201,12 +201,14 @@ def _solid_crossings(
         elif n_a == 0:
             if op == UNION:
                 n_now = n_b
-                T[top - 1, :n_b], S[top - 1, :n_b] = T[top, :n_b], S[top, :n_b]
+                for e in range(n_b):
+                    T[top - 1, e], S[top - 1, e] = T[top, e], S[top, e]
         else:
             n_now = _combine(T, S, top - 1, n_a, top, n_b, op, spare)
             if n_now < 0:
                 return -1
-            T[top - 1, :n_now], S[top - 1, :n_now] = T[spare, :n_now], S[spare, :n_now]
+            for e in range(n_now):
+                T[top - 1, e], S[top - 1, e] = T[spare, e], S[spare, e]
         S[top - 1, LARGEST] = n_now
     return n_now
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
@@ -60,7 +61,7 @@ def kernel_scene(compiled: Compiled | None, beam: Beam, view: View, T_FW: dict[F
     return KernelScene(solids=solids, beam=beam.arrays, s=view.source, O=view.O, U=view.U, V=view.V, boxes=boxes)
 
 
-@njit(cache=True, nogil=True)
+@register_jitable
 def work_space(c: KernelScene, depth: int) -> WorkSpace:
     """Work space for solids whose programs need that depth."""
     return WorkSpace(
@@ -71,7 +72,7 @@ def work_space(c: KernelScene, depth: int) -> WorkSpace:
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def lengths(c: KernelScene, work: WorkSpace, u: float, v: float) -> Any:
     """The signature of the ray through pixel coordinates (u, v); its path lengths are in work.L."""
     nothing = True
@@ -96,30 +97,7 @@ def at(c: KernelScene, work: WorkSpace, u: float, v: float) -> Any:
     return 1.0 if signature == 0 else attenuated(c.beam, work.L), signature
 
 
-@njit(cache=True, nogil=True)
-def coarse_corners(
-    c: KernelScene,
-    depth: int,
-    u_0: int,
-    v_0: int,
-    mask: np.ndarray,
-    j_0: int,
-    j_1: int,
-    I: np.ndarray,
-    seen: np.ndarray,
-) -> None:
-    """Every BLOCK-th corner, rows j_0 to j_1 of them; seen is 0 where nothing is met, or less than may be met."""
-    work = work_space(c, depth)
-    for j in range(j_0, j_1):
-        for i in range(I.shape[1]):
-            I[j, i], seen[j, i] = 1.0, 0
-            if mask[BLOCK * j, BLOCK * i]:
-                I[j, i], seen[j, i] = at(c, work, u_0 + BLOCK * i - 0.5, v_0 + BLOCK * j - 0.5)
-                if work.active.sum() != work.S[-1, -1]:
-                    seen[j, i] = 0
-
-
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _even(I: np.ndarray, seen: np.ndarray, j: int, i: int) -> bool:
     """Whether cubic interpolation between coarse corners (j, i) and (j + 1, i + 1) denotes the rays there."""
     if j < 1 or i < 1 or j + 2 >= I.shape[0] or i + 2 >= I.shape[1] or seen[j, i] == 0:
@@ -147,7 +125,7 @@ def _cubic(x: float) -> Any:
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _interpolated(rough: np.ndarray, J: int, K: int, w_y: Arrays, w_x: Arrays) -> float:
     """The value within coarse corners (J, K) and (J + 1, K + 1) by those weights."""
     total = 0.0
@@ -158,11 +136,12 @@ def _interpolated(rough: np.ndarray, J: int, K: int, w_y: Arrays, w_x: Arrays) -
 
 
 @njit(cache=True, nogil=True)
-def all_corners(
+def corners(
     c: KernelScene,
-    depth: int,
+    work: WorkSpace,
     u_0: int,
     v_0: int,
+    step: int,
     mask: np.ndarray,
     rough: np.ndarray,
     rough_seen: np.ndarray,
@@ -171,18 +150,19 @@ def all_corners(
     I: np.ndarray,
     seen: np.ndarray,
 ) -> bool:
-    """Transmission and signature at the pixels' corners, rows j_0 to j_1; False where a list overflowed.
+    """Transmission and signature at every step-th of the pixels' corners, rows j_0 to j_1 of them; False where a list
+    overflowed.
 
-    rough, rough_seen: coarse corners (`coarse_corners`), or arrays of no rows where every ray is to be cast.
+    Where step > 1, seen is 0 where nothing is met, or less than may be met.  rough, rough_seen: such corners, BLOCK
+    apart, between which rays are interpolated; or arrays of no rows where every ray is to be cast.
     """
-    work = work_space(c, depth)
     fine = True
     even = np.zeros(I.shape[1] // BLOCK + 1, dtype=np.bool_)
     for j in range(j_0, j_1):
         J, y = j // BLOCK, (j % BLOCK) / BLOCK
-        if j == j_0 or y == 0:
+        if rough.shape[0] > 0 and (j == j_0 or y == 0):
             for K in range(len(even)):
-                even[K] = rough.shape[0] > 0 and _even(rough, rough_seen, J, K)
+                even[K] = _even(rough, rough_seen, J, K)
         w_y = _cubic(y)
         for i in range(I.shape[1]):
             I[j, i], seen[j, i] = 1.0, 0
@@ -190,8 +170,14 @@ def all_corners(
             if even[K]:
                 w_x = _cubic((i % BLOCK) / BLOCK)
                 I[j, i], seen[j, i] = _interpolated(rough, J, K, w_y, w_x), rough_seen[J, K]
-            elif mask[j, i]:
-                I[j, i], seen[j, i] = at(c, work, u_0 + i - 0.5, v_0 + j - 0.5)
+            elif mask[step * j, step * i]:
+                I[j, i], seen[j, i] = at(c, work, u_0 + step * i - 0.5, v_0 + step * j - 0.5)
                 if seen[j, i] < 0:
                     fine = False
+                if step > 1:
+                    met = 0
+                    for k in range(len(work.active)):
+                        met += work.active[k]
+                    if met != work.S[-1, -1]:
+                        seen[j, i] = 0
     return fine
