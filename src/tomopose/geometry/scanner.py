@@ -161,26 +161,24 @@ class Scanner:
     @property
     def T_WS(self) -> RigidTransform:
         """World to source.  Eq. (4)."""
-        return RigidTransform(R=R_WS, t=np.array([0.0, 0.0, self.d_SR]), source=Frame.W, target=Frame.S)
+        return RigidTransform.of_rotations(R_WS, np.array([0.0, 0.0, self.d_SR]), Frame.W, Frame.S)
 
     @property
     def table_axis(self) -> RigidTransform:
         """A map of W onto itself that takes the z axis to the real table axis; the identity for the paper's setup."""
-        return RigidTransform(
-            R=R_x(self.axis_tilt_x) @ R_y(self.axis_tilt_y),
-            t=np.array([0.0, self.axis_y, 0.0]),
-            source=Frame.W,
-            target=Frame.W,
-        )
+        R = R_x(self.axis_tilt_x) @ R_y(self.axis_tilt_y)
+        return RigidTransform.of_rotations(R, np.array([0.0, self.axis_y, 0.0]), Frame.W, Frame.W)
 
     def T_TW(self, alpha: Array | float) -> RigidTransform:
         """Table to world at table angle alpha (rad): a turn about the table axis, the identity at 0.  Paper sec. 3."""
         alpha = np.asarray(alpha, dtype=np.float64)
+        if not np.isfinite(alpha).all():
+            raise InputError("table angles hold values that are not finite")
         if self.axis_y == self.axis_tilt_x == self.axis_tilt_y == 0.0:
-            return RigidTransform(R=R_z(alpha), t=np.zeros((*alpha.shape, 3)), source=Frame.T, target=Frame.W)
+            return RigidTransform.of_rotations(R_z(alpha), np.zeros((*alpha.shape, 3)), Frame.T, Frame.W)
         axis = self.table_axis
         R = axis.R @ R_z(alpha) @ axis.R.T
-        return RigidTransform(R=R, t=axis.t - R @ axis.t, source=Frame.T, target=Frame.W)
+        return RigidTransform.of_rotations(R, axis.t - R @ axis.t, Frame.T, Frame.W)
 
     def binned(self, factor: int) -> Scanner:
         """The scanner of images averaged over factor x factor pixels.

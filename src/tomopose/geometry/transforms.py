@@ -61,8 +61,8 @@ class RigidTransform:
         object.__setattr__(self, "t", t)
 
     @classmethod
-    def _of_rotations(cls, R: Array, t: Array, source: Frame, target: Frame) -> RigidTransform:
-        """Of products, inverses and members of transforms: their R are rotations, and are not tested again."""
+    def of_rotations(cls, R: Array, t: Array, source: Frame, target: Frame) -> RigidTransform:
+        """Of R that are rotations by the way they were made (products, turns about axes), and are not tested."""
         made = object.__new__(cls)
         for name, held in (("R", float_array(R)), ("t", float_array(t)), ("source", source), ("target", target)):
             object.__setattr__(made, name, held)
@@ -108,7 +108,7 @@ class RigidTransform:
     @property
     def inv(self) -> RigidTransform:
         R_inv = np.swapaxes(self.R, -1, -2)
-        return self._of_rotations(R_inv, -(R_inv @ self.t[..., None])[..., 0], self.target, self.source)
+        return self.of_rotations(R_inv, -(R_inv @ self.t[..., None])[..., 0], self.target, self.source)
 
     def log(self) -> Array:
         """The six coordinates (..., 6) of the screw that makes this transform: (rho, w), mm and rad; exp gives it back.
@@ -152,7 +152,7 @@ class RigidTransform:
                 target=self.source,
             )
         t = (self.R @ other.t[..., None])[..., 0] + self.t
-        return self._of_rotations(self.R @ other.R, t, other.source, self.target)
+        return self.of_rotations(self.R @ other.R, t, other.source, self.target)
 
     def require(self, source: Frame, target: Frame) -> RigidTransform:
         """This transform, if it joins those frames; FrameMismatchError otherwise."""
@@ -176,7 +176,7 @@ class RigidTransform:
         R, t = self.R[index], self.t[index]
         if R.ndim not in (2, 3) or R.shape[-2:] != (3, 3):
             raise ShapeError(f"an index into a sequence of transforms selects whole ones; got R {R.shape}")
-        return self._of_rotations(R, t, self.source, self.target)
+        return self.of_rotations(R, t, self.source, self.target)
 
     def __iter__(self) -> Iterator[RigidTransform]:
         return (self[k] for k in range(len(self)))

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.model.silhouettes import Cameras
 from tomopose.calibration.rigid.estimate import LIKELY
-from tomopose.calibration.rigid.fit import Fit, balls_in_table
 from tomopose.errors import InputError
 from tomopose.units import Array
 
@@ -45,27 +45,10 @@ class Placement:
         return self.possible and self.off_axis < np.log(LIKELY)
 
 
-def beams(problem: Problem) -> Array:
-    """(n, 4): direction of the beam in T and offset, which give a point's distance from the focal spot along it, mm."""
-    found = np.empty((len(problem), 4))
-    for r, scanner in enumerate(problem.scanners):
-        mine = problem.run == r
-        alpha, which = np.unique(problem.alpha[mine], return_inverse=True)
-        T_TS = scanner.T_WS @ scanner.T_TW(alpha)
-        found[mine] = np.column_stack([T_TS.R[:, 2], T_TS.t[:, 2]])[which.reshape(-1)]
-    return found
-
-
-def depths(problem: Problem, fit: Fit, beam: Array | None = None) -> Array:
-    """(n,) mm: distance of the ball from the focal spot along the beam, in every pose; beam: of `beams`, if known."""
-    x_T = balls_in_table(problem, fit)
-    beam = beams(problem) if beam is None else beam
-    return np.asarray((beam[:, :3] * x_T).sum(axis=1) + beam[:, 3])
-
-
-def placement(problem: Problem, fit: Fit, beam: Array | None = None) -> Placement:
-    """Of a fit; beam: of `beams`, if known."""
-    z = np.sort(depths(problem, fit, beam))
+def placement(problem: Problem, x_T: Array, cameras: Cameras) -> Placement:
+    """Of a fit that places the ball of each row at x_T (n, 3), mm in T."""
+    beam = cameras.beam
+    z = np.sort((beam[:, :3] * x_T).sum(axis=1) + beam[:, 3])
     first = problem.scanners[problem.run[0]]
     return Placement(
         nearest=float(z[0]),

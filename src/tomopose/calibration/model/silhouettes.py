@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
+from tomopose.calibration.model.covariance import median
 from tomopose.calibration.model.problem import Problem
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
@@ -14,29 +16,66 @@ from tomopose.units import Array
 
 @dataclass(frozen=True, kw_only=True)
 class Cameras:
-    """P (n, 3, 4): from T to pixels, of every row;  d_SR (n,) mm;  source (3,): where the
-    source is in T in the first pose, mm."""
+    """at_angle (k, 3, 4): from T to pixels, of every run at each of its table angles;  beams (k, 4): direction of the
+    beam in T and offset, which give a point's distance from the focal spot along it, mm;  alpha (k,) rad, run (k,): of
+    these;  which (n,): the one of every row;  d_SR (n,) mm;  source (3,): where the source is in T in the first pose,
+    mm."""
 
-    P: Array
+    at_angle: Array
+    beams: Array
+    alpha: Array
+    run: npt.NDArray[np.int64]
+    which: npt.NDArray[np.int64]
     d_SR: Array
     source: Array
 
     @classmethod
     def of(cls, problem: Problem) -> Cameras:
         """Of the scanners at the table angles of a problem."""
-        P, d_SR, source = np.empty((len(problem), 3, 4)), np.empty(len(problem)), np.zeros(3)
-        for r, scanner in enumerate(problem.scanners):
-            alone = len(problem.scanners) == 1
-            mine = slice(None) if alone else problem.run == r
-            alpha, which = np.unique(problem.alpha[mine], return_inverse=True)
-            T_WS, T_TW = scanner.T_WS.matrix, scanner.T_TW(alpha)
-            P[mine] = (scanner.P_S @ T_WS @ T_TW.matrix)[which.reshape(-1)]
-            d_SR[mine] = scanner.d_SR
-            if r == problem.run[0]:
-                first = int(which.reshape(-1)[0])
-                at_W = -T_WS[:3, :3].T @ T_WS[:3, 3]
-                source = T_TW.R[first].T @ (at_W - T_TW.t[first])
-        return cls(P=P, d_SR=d_SR, source=source)
+        alpha, run, which, k = [], [], np.empty(len(problem), dtype=np.int64), 0
+        for r in range(len(problem.scanners)):
+            mine = problem.run == r
+            angles, place = np.unique(problem.alpha[mine], return_inverse=True)
+            alpha.append(angles)
+            run.append(np.full(len(angles), r))
+            which[mine] = k + place.reshape(-1)
+            k += len(angles)
+        return cls._seen(problem.scanners, np.concatenate(alpha), np.concatenate(run), which)
+
+    @classmethod
+    def _seen(
+        cls,
+        scanners: tuple[Scanner, ...],
+        alpha: Array,
+        run: npt.NDArray[np.int64],
+        which: npt.NDArray[np.int64],
+    ) -> Cameras:
+        P, beams, source = np.empty((len(alpha), 3, 4)), np.empty((len(alpha), 4)), np.zeros(3)
+        first = which[0]
+        for r, scanner in enumerate(scanners):
+            mine = run == r
+            T_TS = scanner.T_WS @ scanner.T_TW(alpha[mine])
+            to_S = np.concatenate([T_TS.R, T_TS.t[:, :, None]], axis=2)
+            P[mine], beams[mine] = scanner.K @ to_S, to_S[:, 2]
+            if r == run[first]:
+                own = int(first - np.flatnonzero(mine)[0])
+                source = -T_TS.R[own].T @ T_TS.t[own]
+        d_SR = np.array([s.d_SR for s in scanners])[run][which]
+        return cls(at_angle=P, beams=beams, alpha=alpha, run=run, which=which, d_SR=d_SR, source=source)
+
+    def with_scanners(self, scanners: tuple[Scanner, ...]) -> Cameras:
+        """The same table angles seen by scanners with other values."""
+        return self._seen(scanners, self.alpha, self.run, self.which)
+
+    @property
+    def P(self) -> Array:
+        """(n, 3, 4): from T to pixels, of every row."""
+        return np.asarray(self.at_angle[self.which])
+
+    @property
+    def beam(self) -> Array:
+        """(n, 4): the beam of every row."""
+        return np.asarray(self.beams[self.which])
 
 
 def chain_matrices(problem: Problem, scanners: tuple[Scanner, ...], T_HT: RigidTransform) -> Array:
@@ -46,27 +85,43 @@ def chain_matrices(problem: Problem, scanners: tuple[Scanner, ...], T_HT: RigidT
     return np.asarray(Cameras.of(replace(problem, scanners=scanners)).P @ T_HT.matrix @ T_MH)
 
 
-def silhouette_outlines(P: Array, centres: Array, diameter: float) -> Array:
-    """(n,) px^2: product of the semi axes of the silhouettes of balls at centres (n, 3), under P (n, 3, 4).
+def silhouette_outlines(P: Array, centres: Array, diameter: float, which: npt.NDArray[np.int64] | None = None) -> Array:
+    """(n,) px^2: product of the semi axes of the silhouettes of balls at centres (n, 3), under P (n, 3, 4), or (k, 3,
+    4) where `which` (n,) names the one of every ball.
 
     The dual quadric of a sphere, x x^T - r^2 diag(1, 1, 1, 0), has the dual conic P Q P^T as its outline (Hartley and
-    Zisserman, Multiple View Geometry, sec. 8.3), which gives the ellipse's centre and shape.
+    Zisserman, Multiple View Geometry, sec. 8.3), which gives the ellipse's centre and shape: with C = P Q P^T scaled to
+    C_33 = 1, S = m m^T - C_12, where m is the upper part of its last column.
     """
     M = P[:, :, :3]
-    y = (M @ centres[:, :, None])[..., 0] + P[:, :, 3]
-    C = y[:, :, None] * y[:, None, :] - (diameter / 2.0) ** 2 * (M @ np.swapaxes(M, 1, 2))
-    C = C / C[:, 2:, 2:]
-    m = C[:, :2, 2]
-    S = m[:, :, None] * m[:, None, :] - C[:, :2, :2]
-    outline: Array = np.sqrt(np.maximum(S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] * S[:, 1, 0], 0.0))
+    B = (diameter / 2.0) ** 2 * (M @ np.swapaxes(M, 1, 2))
+    if which is not None:
+        P, B = P[which], B[which]
+    y = (P[:, :, :3] @ centres[:, :, None])[..., 0] + P[:, :, 3]
+    a, b, c = y.T
+    B_aa, B_ab, B_ac, B_bb, B_bc, B_cc = (B[:, i, j] for i, j in _UPPER)
+    scale = 1.0 / (c * c - B_cc)
+    m_a, m_b = (a * c - B_ac) * scale, (b * c - B_bc) * scale
+    S_aa, S_bb = m_a * m_a - (a * a - B_aa) * scale, m_b * m_b - (b * b - B_bb) * scale
+    S_ab = m_a * m_b - (a * b - B_ab) * scale
+    outline: Array = np.sqrt(np.maximum(S_aa * S_bb - S_ab * S_ab, 0.0))
     return outline
 
 
-def size_ratio_of(problem: Problem, P: Array, centres: Array, diameter: float | None = None) -> float | None:
+_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def size_ratio_of(
+    problem: Problem,
+    P: Array,
+    centres: Array,
+    diameter: float | None = None,
+    which: npt.NDArray[np.int64] | None = None,
+) -> float | None:
     """Median over the rows of the measured size of the silhouette over the calculated one.
 
-    P (n, 3, 4): from the balls' frame to pixels;  centres (n, 3): of the ball of each row;  diameter: mm, in place of
-    the problem's own.  None without outlines or without a diameter.
+    P, centres (n, 3), which: as of `silhouette_outlines`, of the ball of each row;  diameter: mm, in place of the
+    problem's own.  None without outlines or without a diameter.
     """
     diameter = problem.ball_diameter if diameter is None else diameter
     if problem.outline is None or diameter is None:
@@ -74,6 +129,10 @@ def size_ratio_of(problem: Problem, P: Array, centres: Array, diameter: float | 
     known = np.isfinite(problem.outline)
     if not known.any():
         return None
-    calculated = silhouette_outlines(P[known], centres[known], diameter)
+    measured = problem.outline
+    if not known.all():
+        measured, centres = measured[known], centres[known]
+        P, which = (P[known], None) if which is None else (P, which[known])
+    calculated = silhouette_outlines(P, centres, diameter, which)
     with np.errstate(divide="ignore"):
-        return float(np.sqrt(np.median(problem.outline[known] / calculated)))
+        return float(np.sqrt(median(measured / calculated)))

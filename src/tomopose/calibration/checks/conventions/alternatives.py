@@ -25,7 +25,7 @@ def _upside_down(p: Problem) -> Problem | None:
     """Half a turn about the beam, of images and table together: it takes a scanner into itself."""
     if not p.alpha.any():
         return None
-    centre = np.array([[p.scanners[r].u_0, p.scanners[r].v_0] for r in p.run])
+    centre = np.array([[s.u_0, s.v_0] for s in p.scanners])[p.run]
     return replace(p, x_D=np.ascontiguousarray(2 * centre - p.x_D), alpha=-p.alpha)
 
 
@@ -34,8 +34,7 @@ def _image(matrix: tuple[tuple[int, int], tuple[int, int]]) -> Change:
     S = np.array(matrix, dtype=np.float64)
 
     def change(p: Problem) -> Problem | None:
-        sizes = np.array([[p.scanners[r].n_u - 1.0, p.scanners[r].n_v - 1.0] for r in p.run])
-        centre = sizes / 2
+        centre = np.array([[s.n_u - 1.0, s.n_v - 1.0] for s in p.scanners])[p.run] / 2
         turned = np.abs(S) @ centre[:, :, None]
         return replace(p, x_D=np.ascontiguousarray((p.x_D - centre) @ S.T + turned[..., 0]))
 
@@ -71,15 +70,14 @@ def _lag(lag: int) -> Change:
     """The image of a row belongs to the pose `lag` rows further on, within its run."""
 
     def change(p: Problem) -> Problem | None:
-        where = {(int(r), int(i)): k for k, (r, i) in enumerate(zip(p.run, p.index, strict=True))}
-        pairs = [
-            (k, where[int(r), int(i) + lag])
-            for k, (r, i) in enumerate(zip(p.run, p.index, strict=True))
-            if (int(r), int(i) + lag) in where
-        ]
-        if len(pairs) < FEWEST_PAIRS:
+        place = p.run * (int(p.index.max()) + 1 + 2 * abs(lag)) + p.index  # neighbours of a run differ by 1
+        order = np.argsort(place, kind="stable")
+        last = np.searchsorted(place[order], place + lag, side="right") - 1
+        found = order[np.maximum(last, 0)]
+        image = np.flatnonzero(place[found] == place + lag)
+        if len(image) < FEWEST_PAIRS:
             return None
-        image, pose = (np.array(column) for column in zip(*pairs, strict=True))
+        pose = found[image]
         of_pose, of_image = p.select(pose), p.select(image)
         return replace(
             of_pose, x_D=of_image.x_D, covariance=of_image.covariance, W=of_image.W, outline=of_image.outline

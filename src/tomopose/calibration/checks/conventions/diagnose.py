@@ -31,13 +31,13 @@ from tomopose.calibration.checks.conventions.hypothesis import (
     compared,
     rank,
 )
-from tomopose.calibration.checks.placement import Placement, beams, better_placed, placement
+from tomopose.calibration.checks.placement import Placement, better_placed, placement
 from tomopose.calibration.checks.stability import SIGNIFICANT, Effect, chi2_with_movements, movements
 from tomopose.calibration.model.parameters import UNITS, FreeParameters, free_parameters
 from tomopose.calibration.model.problem import Problem, pair
 from tomopose.calibration.model.silhouettes import Cameras
 from tomopose.calibration.rigid.estimate import best_fit
-from tomopose.calibration.rigid.fit import Fit, residuals
+from tomopose.calibration.rigid.fit import Fit, balls_in_table, residuals, whitened2
 from tomopose.calibration.rigid.start import ray_equations
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
@@ -55,9 +55,12 @@ class _Declared:
     problem: Problem
     free: FreeParameters
     fit: Fit
-    placed: Placement
-    beam: Array
+    x_T: Array
     cameras: Cameras
+
+    @functools.cached_property
+    def placed(self) -> Placement:
+        return placement(self.problem, self.x_T, self.cameras)
 
     @functools.cached_property
     def n_prior(self) -> int:
@@ -81,7 +84,8 @@ class _Declared:
 
     @functools.cached_property
     def own(self) -> Hypothesis:
-        left = Left.of(self.problem, residuals(self.problem, self.free, self.fit))
+        r = residuals(self.problem, self.free, self.fit)
+        left = Left.of(self.problem, r, whitened2(self.problem, r))
         return Hypothesis(
             name="declared",
             words="the data as declared",
@@ -97,7 +101,7 @@ class _Declared:
             d_SR=self.placed.d_SR,
             possible=self.placed.possible,
             share=left.share,
-            size_ratio=size_ratio(self.problem, self.free, self.fit, self.cameras),
+            size_ratio=size_ratio(self.problem, self.free, self.fit, self.x_T, self.cameras),
         )
 
 
@@ -117,10 +121,8 @@ def ranked(
     held = free_parameters(problem.scanners, fix=tuple(UNITS))
     cameras = Cameras.of(problem)
     rays = ray_equations(problem, cameras)
-    beam = beams(problem)
-    declared = _Declared(
-        problem=problem, free=free, fit=fit, placed=placement(problem, fit, beam), beam=beam, cameras=cameras
-    )
+    x_T = balls_in_table(problem, fit)
+    declared = _Declared(problem=problem, free=free, fit=fit, x_T=x_T, cameras=cameras)
     hopeless = HOPELESS * max(fit.chi2, float(declared.own.dof))
     tried: list[tuple[Alternative, Reading]] = []
     for alternative in alternatives:
@@ -128,26 +130,26 @@ def ranked(
         if changed is None or declared.dof(changed) <= 0:
             continue
         same_table = changed.alpha is problem.alpha
-        known = cameras if same_table else None
-        of_changed = rays if same_table and changed.x_D is problem.x_D else ray_equations(changed, known)
-        tried.append((alternative, Reading.of(changed, of_changed, thoroughly=starts > 0)))
+        seen_by = cameras if same_table else Cameras.of(changed)
+        of_changed = rays if same_table and changed.x_D is problem.x_D else ray_equations(changed, seen_by)
+        tried.append((alternative, Reading.of(changed, seen_by, of_changed, thoroughly=starts > 0)))
     found = [declared.own]
     for (alternative, one), start in zip(tried, linear_starts([one for _, one in tried]), strict=True):
         other = fitted(one, start, free, held, starts=starts, hopeless=hopeless)
         if not np.isfinite(other.fit.chi2):
             continue
-        judged = _judged_beside_movements(declared, alternative, one.problem, other)
+        judged = _judged_beside_movements(declared, alternative, one, other)
         if judged is not None:
             found.append(judged)
     return Diagnosis(hypotheses=rank(found))
 
 
 def _judged_beside_movements(
-    declared: _Declared, alternative: Alternative, changed: Problem, other: Fitted
+    declared: _Declared, alternative: Alternative, one: Reading, other: Fitted
 ) -> Hypothesis | None:
     """The judgement; where the alternative fits better and something still moved under it, with both free to move."""
-    free, fit = declared.free, other.fit
-    judged = _judged(declared, alternative, changed, other, declared.fit.chi2)
+    changed, free, fit = one.problem, declared.free, other.fit
+    judged = _judged(declared, alternative, one, other, declared.fit.chi2)
     if judged is None or judged.delta > -BETTER:
         return judged
     moved = _moved(changed, free, fit)
@@ -155,7 +157,7 @@ def _judged_beside_movements(
         return judged
     following = replace(other, fit=replace(fit, chi2=chi2_with_movements(changed, free, fit, moved)))
     chi2 = chi2_with_movements(declared.problem, free, declared.fit, moved)
-    still = _judged(declared, alternative, changed, following, chi2)
+    still = _judged(declared, alternative, one, following, chi2)
     if still is not None and still.outcome == "better":
         return replace(judged, outcome="better", sigmas=still.sigmas)
     return judged if still is None or judged.outcome != "better" else replace(still, chi2=fit.chi2)
@@ -166,13 +168,13 @@ def _moved(problem: Problem, free: FreeParameters, fit: Fit) -> list[Effect]:
 
 
 def _judged(
-    declared: _Declared, alternative: Alternative, changed: Problem, other: Fitted, chi2: float
+    declared: _Declared, alternative: Alternative, one: Reading, other: Fitted, chi2: float
 ) -> Hypothesis | None:
     """The comparison of one alternative; None where it puts a ball where none can be, or only renames the unit."""
-    fit = other.fit
-    same = changed.alpha is declared.problem.alpha and len(changed) == len(declared.problem)
-    placed = placement(changed, fit, declared.beam if same else None)
-    left = Left.of(changed, other.r)
+    changed, fit = one.problem, other.fit
+    x_T = balls_in_table(changed, fit)
+    placed = placement(changed, x_T, one.cameras)
+    left = Left.of(changed, other.r, other.d2)
     dof = declared.dof(changed)
     judged = compared(
         declared.hypothesis(chi2),
@@ -194,7 +196,7 @@ def _judged(
             d_SR=placed.d_SR,
             possible=placed.possible,
             share=left.share,
-            size_ratio=size_ratio(changed, declared.free, fit, declared.cameras if same else None),
+            size_ratio=size_ratio(changed, declared.free, fit, x_T, one.cameras),
         ),
     )
     likelier = better_placed(placed, declared.placed) and not changed.units_confirmed

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -20,7 +21,7 @@ from tomopose.calibration.model.parameters import (
 )
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.model.silhouettes import Cameras, size_ratio_of
-from tomopose.calibration.rigid.fit import Fit, balls_in_table, minimise, residuals, whitened2
+from tomopose.calibration.rigid.fit import Fit, minimise, residuals, whitened2
 from tomopose.calibration.rigid.start import Rays, closed_forms, other_starts, ray_equations, turned_about_beam
 from tomopose.units import Array
 
@@ -48,33 +49,34 @@ class Left:
     share: float
 
     @classmethod
-    def of(cls, problem: Problem, r: Array) -> Left:
-        """r (n, 2) px: residuals of all rows."""
-        d2 = np.sort(whitened2(problem, r))
-        kept = d2[: max(1, int(np.ceil(BELONGING * len(d2))))]
-        d_rms = float(np.sqrt((r**2).sum() / len(r)))
-        spread = float(np.sqrt(((problem.x_D - problem.x_D.mean(axis=0)) ** 2).sum() / len(r)))
+    def of(cls, problem: Problem, r: Array, d2: Array) -> Left:
+        """r (n, 2) px, d2 (n,): residuals of all rows, and their squares in standard deviations."""
+        n = len(d2)
+        kept = np.sort(d2)[: max(1, int(np.ceil(BELONGING * n)))]
+        d_rms = math.sqrt(float(np.vdot(r, r)) / n)
+        from_mean = problem.x_D - problem.x_D.sum(axis=0) / n
+        spread = math.sqrt(float(np.vdot(from_mean, from_mean)) / n)
         return cls(
             d_rms=d_rms,
-            sigmas=float(np.sqrt(kept.mean() / BELONGING_MEAN)),
+            sigmas=math.sqrt(float(kept.sum()) / len(kept) / BELONGING_MEAN),
             share=d_rms / spread if spread > 0 else 0.0,
         )
 
 
-def size_ratio(problem: Problem, free: FreeParameters, fit: Fit, cameras: Cameras | None = None) -> float:
+def size_ratio(problem: Problem, free: FreeParameters, fit: Fit, x_T: Array, cameras: Cameras) -> float:
     """Measured size of the silhouettes over the calculated one; NaN where it is not known or cannot be calculated.
 
-    cameras: of the problem with the scanners' values as they are, where known.
+    x_T (n, 3) mm: where the fit places the balls;  cameras: of the problem's scanners, before the fit moved them.
     """
     if problem.outline is None or problem.ball_diameter is None or not np.isfinite(fit.chi2):
         return float("nan")
-    if cameras is None or fit.delta.any():
+    if fit.delta.any():
         try:
             scanners = adjusted_scanners(problem.scanners, free, fit.delta)
         except ImpossibleScannerError:  # a wrong reading may end anywhere
             return float("nan")
-        cameras = Cameras.of(replace(problem, scanners=scanners))
-    found = size_ratio_of(problem, cameras.P, balls_in_table(problem, fit))
+        cameras = cameras.with_scanners(scanners)
+    found = size_ratio_of(problem, cameras.at_angle, x_T, which=cameras.which)
     return float("nan") if found is None else found
 
 
@@ -88,18 +90,19 @@ def _spread(n: int) -> npt.NDArray[np.int64]:
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """A problem as an alternative reads it, with its rays and the rows (k,) that it is fitted to first."""
+    """A problem as an alternative reads it, with its cameras and rays, and the rows (k,) that it is fitted to first."""
 
     problem: Problem
+    cameras: Cameras
     rays: Rays
     rows: npt.NDArray[np.int64]
 
     @classmethod
-    def of(cls, problem: Problem, rays: Rays, *, thoroughly: bool) -> Reading:
+    def of(cls, problem: Problem, cameras: Cameras, rays: Rays, *, thoroughly: bool) -> Reading:
         """With all rows first where they are few, or where it is to be thorough."""
         n = len(problem)
         few = thoroughly or n <= 2 * FIRST_ROWS or len(problem.ball_ids) > 1
-        return cls(problem=problem, rays=rays, rows=np.arange(n) if few else _spread(n))
+        return cls(problem=problem, cameras=cameras, rays=rays, rows=np.arange(n) if few else _spread(n))
 
     @property
     def whole(self) -> bool:
@@ -141,10 +144,12 @@ def linear_starts(readings: Sequence[Reading]) -> list[tuple[Array, Array, Array
 
 @dataclass(frozen=True, kw_only=True)
 class Fitted:
-    """fit: the optimum, or where part of the rows lead;  r (n, 2) px: what it leaves in all rows."""
+    """fit: the optimum, or where part of the rows lead;  r (n, 2) px: what it leaves in all rows;  d2 (n,): their
+    squares in standard deviations."""
 
     fit: Fit
     r: Array
+    d2: Array
 
 
 def fitted(
@@ -170,14 +175,16 @@ def fitted(
     if len(fit.delta) != len(free):
         fit = replace(fit, delta=np.zeros(len(free)))
     r = residuals(problem, free, fit)
+    d2 = whitened2(problem, r)
     if one.whole:
-        return Fitted(fit=fit, r=r)
-    chi2 = float(whitened2(problem, r).sum() + (free.information * fit.delta**2).sum())
+        return Fitted(fit=fit, r=r, d2=d2)
+    chi2 = float(d2.sum() + (free.information * fit.delta**2).sum())
     if not chi2 < hopeless:
         # a ball behind the source in any row makes the reading impossible
-        return Fitted(fit=replace(fit, chi2=chi2 if np.isfinite(chi2) else np.inf), r=r)
+        return Fitted(fit=replace(fit, chi2=chi2 if np.isfinite(chi2) else np.inf), r=r, d2=d2)
     fit = minimise(problem, free, fit, iterations=ITERATIONS)
-    return Fitted(fit=fit, r=residuals(problem, free, fit))
+    r = residuals(problem, free, fit)
+    return Fitted(fit=fit, r=r, d2=whitened2(problem, r))
 
 
 def _from_elsewhere(one: Reading, start: tuple[Array, Array, Array], held: FreeParameters, starts: int) -> Fit:
@@ -196,6 +203,8 @@ def _from_elsewhere(one: Reading, start: tuple[Array, Array, Array], held: FreeP
 
 def optimum_under(problem: Problem, free: FreeParameters) -> Fit:
     """The optimum of a problem that an alternative made."""
-    one = Reading(problem=problem, rays=ray_equations(problem), rows=np.arange(len(problem)))
+    cameras = Cameras.of(problem)
+    rays = ray_equations(problem, cameras)
+    one = Reading(problem=problem, cameras=cameras, rays=rays, rows=np.arange(len(problem)))
     held = free_parameters(problem.scanners, fix=tuple(UNITS))
     return fitted(one, linear_starts([one])[0], free, held).fit
