@@ -22,8 +22,8 @@ from chain import World, intrinsic_xyz
 import tomopose as tp
 
 NOISE = 0.0146
-PLATFORM_SCALE, ROBOT_SCALE = 3e-6, 1e-3
-"""Documented defaults for the scale of a manipulator's translations."""
+PLATFORM_SCALE, ROBOT_SCALE = 5e-5, 1e-3
+"""Documented defaults for the scale of a manipulator's translations, where nothing is stated of the scanner."""
 FLOOR = 0.002
 """px: below it a true error is noise of the benchmark, whatever its ratio to the stated one."""
 ARRANGEMENTS = ("hexapod", "two balls", "robot", "moving")

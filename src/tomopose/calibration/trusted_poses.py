@@ -37,7 +37,7 @@ from tomopose.calibration.rigid.estimate import Solution, solve, with_pose_noise
 from tomopose.calibration.rigid.fit import blocks
 from tomopose.calibration.rigid.observability import observability
 from tomopose.errors import NotConvergedError, NotObservableError
-from tomopose.geometry.scanner import Scanner
+from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
 from tomopose.manipulator.error_models import PoseScatter, RigidErrors
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import Repeatability
@@ -135,7 +135,7 @@ def _rigid(
             contradicted=taken.contradicted,
             tests=tests,
             undistinguished=taken.undistinguished,
-            unseen=_unseen(solution, linear, moving_scanner=arrangement == "moving-scanner", exact=taken.exact),
+            unseen=_unseen(solution, linear, taken, moving_scanner=arrangement == "moving-scanner"),
             provenance=provenance(arguments=arguments),
         )
     )
@@ -171,7 +171,7 @@ FEWEST_TESTED = 10
 """Equations beyond the unknowns that the tests need."""
 
 
-def _unseen(solution: Solution, linear: LinearFit, *, moving_scanner: bool, exact: tuple[str, ...]) -> Unseen:
+def _unseen(solution: Solution, linear: LinearFit, taken: Taken, *, moving_scanner: bool) -> Unseen:
     """What no ball shows of table and manipulator, and how the estimate answers to it."""
     p, fit = solution.used, solution.fit
     return unseen_of(
@@ -183,7 +183,8 @@ def _unseen(solution: Solution, linear: LinearFit, *, moving_scanner: bool, exac
         origin=p.t_MH,
         alpha=p.alpha,
         moving_scanner=moving_scanner,
-        scale_known="translation_scale" in (*exact, *solution.free.names),
+        scale_known="translation_scale" in (*taken.exact, *solution.free.names),
+        measured=all(a.source != "default" for a in taken.assumed if a.name in PARAMETER_UNITS),
     )
 
 

@@ -12,6 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from tomopose.calibration.model.assumed import (
+    AS_DELIVERED_ROTATION_SCALE,
+    AS_DELIVERED_TRANSLATION_SCALE,
     ROBOT_TRANSLATION_SCALE,
     ROTATION_SCALE,
     TRANSLATION_SCALE,
@@ -46,14 +48,19 @@ class Unseen:
     gain: Array
 
 
-def unseen_sigma(names: tuple[str, ...], *, robot: bool) -> Array:
-    """Prior standard deviations; the second harmonic of a wobble is half the first."""
+def unseen_sigma(names: tuple[str, ...], *, robot: bool, measured: bool) -> Array:
+    """Prior standard deviations; the second harmonic of a wobble is half the first.
+
+    measured: whether every value of the scanner has a standard deviation that the user stated.
+    """
+    rotations = ROTATION_SCALE if measured else AS_DELIVERED_ROTATION_SCALE
+    translations = TRANSLATION_SCALE if measured else AS_DELIVERED_TRANSLATION_SCALE
     values = []
     for name in names:
         size = (
-            (ROBOT_TRANSLATION_SCALE if robot else TRANSLATION_SCALE)
+            (ROBOT_TRANSLATION_SCALE if robot else translations)
             if name == TRANSLATIONS
-            else ROTATION_SCALE
+            else rotations
             if name in ROTATIONS
             else WOBBLE_RAD
             if name.startswith("table_tilt")
@@ -144,13 +151,14 @@ def unseen_of(
     alpha: Array,
     moving_scanner: bool,
     scale_known: bool = False,
+    measured: bool = True,
 ) -> Unseen:
     """What no ball shows of table and manipulator, and how the estimate of any model answers to it.
 
     b: of the rows used;  covariance (m, m), J (n, 2, m), V (n, 2, 2): of the fit;  scale_known: the scale of the
-    translations is among the parameters or exact;  the others as of `unseen_columns`.
+    translations is among the parameters or exact;  measured: as of `unseen_sigma`;  the others as of `unseen_columns`.
     """
     turned = largest_turn(b.R_MH)
     names = unseen_names(turned, table=not moving_scanner, translations=not scale_known)
     C = unseen_columns(names, b, T_HT=T_HT, origin=origin, alpha=alpha, about_H=moving_scanner)
-    return unseen_gain(names, unseen_sigma(names, robot=turned > PLATFORM_RAD), covariance, J, V, C)
+    return unseen_gain(names, unseen_sigma(names, robot=turned > PLATFORM_RAD, measured=measured), covariance, J, V, C)

@@ -172,8 +172,12 @@ def solve(
     robust: bool = True,
     start: Fit | None = None,
     noise: PoseNoise | None = None,
+    before: RobustFit | None = None,
 ) -> Solution:
-    """Best fit, outliers set aside, observability demanded, covariance by the stated rule."""
+    """Best fit, outliers set aside, observability demanded, covariance by the stated rule.
+
+    before: as of `robust_fit`.
+    """
     first = best_fit(problem, free) if start is None else minimise(problem, free, start)
     if not np.isfinite(first.chi2):
         raise NotConvergedError("no start led to an optimum with the ball in front of the source in every pose")
@@ -185,7 +189,7 @@ def solve(
     if noise is None:
         require_observable(problem, free, J)
     result = (
-        robust_fit(problem, free, first, b.x_D, J)
+        robust_fit(problem, free, first, b.x_D, J, before=before)
         if robust
         else RobustFit(fit=first, keep=everything, distance2=np.full(len(problem), np.nan), scale=np.nan, misfit=False)
     )
@@ -251,7 +255,7 @@ def with_pose_noise(
             return solution
         V = total_covariance(original.covariance, solution.at_all_rows(), noise)
         problem = original.with_covariance(V)
-        solution = solve(problem, free, robust=robust, start=solution.fit, noise=noise)
+        solution = solve(problem, free, robust=robust, start=solution.fit, noise=noise, before=solution.robust)
     return solution
 
 

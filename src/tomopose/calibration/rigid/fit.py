@@ -17,6 +17,7 @@ from tomopose.least_squares import CODES, Status
 from tomopose.units import Array
 
 ITERATIONS = 60
+_THREE_HALVES = 1.5 * np.eye(3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +80,7 @@ def minimise(
     chi2, code, at, N = levenberg_marquardt(rows_of(problem, weight), freed_of(problem, free), at, iterations)
     # the rounding of many steps, taken off R: the nearest rotation, to second order in its distance
     return Fit(
-        R_HT=at.R_HT @ (1.5 * np.eye(3) - 0.5 * (at.R_HT.T @ at.R_HT)),
+        R_HT=at.R_HT @ (_THREE_HALVES - 0.5 * (at.R_HT.T @ at.R_HT)),
         t_HT=at.t_HT,
         t=at.t,
         delta=at.delta,

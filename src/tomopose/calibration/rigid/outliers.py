@@ -79,26 +79,21 @@ def _scale(distance2: Array) -> float:
     return median(distance2) / MEDIAN_CHI2_2
 
 
-def robust_fit(problem: Problem, free: FreeParameters, start: Fit, x_calc: Array, J: Array) -> RobustFit:
+def robust_fit(
+    problem: Problem, free: FreeParameters, start: Fit, x_calc: Array, J: Array, *, before: RobustFit | None = None
+) -> RobustFit:
     """The fit without the rows that do not belong, from the ordinary fit `start`; x_calc, J: of it, as of
-    `studentised`."""
+    `studentised`;  before: of the same rows with other covariances, whose outliers are tried first."""
     n = len(problem)
     all_rows = np.ones(n, dtype=bool)
     d2 = first = studentised(problem, start, all_rows, x_calc, J)
     scale = _scale(d2)
     if d2.max() <= limit(n) * max(1.0, scale):
         return RobustFit(fit=start, keep=all_rows, distance2=d2, scale=scale, misfit=False)
-    fit, weight = start, all_rows.astype(float)
-    for _ in range(REWEIGHTINGS):
-        d2 = whitened2(problem, residuals(problem, free, fit))
-        # Geman-McClure, whose influence falls to zero: a gross error does not pull at all
-        new = (1.0 + d2 / (9.0 * max(1.0, _scale(d2)))) ** -2
-        fit = minimise(problem, free, fit, weight=new, iterations=4)
-        settled = np.abs(new - weight).max() < 1e-3
-        weight = new
-        if settled:
-            break
-    keep = d2 <= limit(n) * max(1.0, _scale(d2))
+    if before is None or before.keep.all():
+        fit, keep = _reweighted(problem, free, start)
+    else:
+        fit, keep = before.fit, before.keep
     for turn in range(2 * RECLASSIFICATIONS):
         if keep.mean() < 1.0 - LARGEST_SHARE or 2 * keep.sum() <= fit.N.shape[0] + 4:
             break
@@ -114,3 +109,19 @@ def robust_fit(problem: Problem, free: FreeParameters, start: Fit, x_calc: Array
             return RobustFit(fit=fit, keep=keep, distance2=d2, scale=scale, misfit=False)
         keep = new_keep
     return RobustFit(fit=start, keep=all_rows, distance2=first, scale=scale, misfit=True)
+
+
+def _reweighted(problem: Problem, free: FreeParameters, start: Fit) -> tuple[Fit, npt.NDArray[np.bool_]]:
+    """A fit to which rows count the less the farther they are, and the rows (n,) that it does not place far away."""
+    fit, weight = start, np.ones(len(problem))
+    for _ in range(REWEIGHTINGS):
+        d2 = whitened2(problem, residuals(problem, free, fit))
+        scale = max(1.0, _scale(d2))
+        # Geman-McClure, whose influence falls to zero: a gross error does not pull at all
+        new = (1.0 + d2 / (9.0 * scale)) ** -2
+        fit = minimise(problem, free, fit, weight=new, iterations=2)
+        settled = np.abs(new - weight).max() < 1e-3
+        weight = new
+        if settled:
+            break
+    return fit, d2 <= limit(len(problem)) * scale
