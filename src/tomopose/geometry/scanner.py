@@ -133,9 +133,15 @@ class Scanner:
         return self.n_v, self.n_u
 
     @property
+    def _panel_axes(self) -> Array:
+        """(3, 3): the rotation of the panel, written in S."""
+        R: Array = R_x(self.theta) @ R_y(self.phi) @ R_z(self.eta)
+        return R
+
+    @property
     def panel(self) -> tuple[Array, Array, Array]:
         """(U, V, O) in S, mm: the steps from pixel to pixel along u and v, and the centre of pixel (0, 0)."""
-        R = R_x(self.theta) @ R_y(self.phi) @ R_z(self.eta)
+        R = self._panel_axes
         U, V = R @ [-self.p_u, 0.0, 0.0], R @ [0.0, self.p_v, 0.0]
         return U, V, np.array([0.0, 0.0, self.d_SD]) - self.u_0 * U - self.v_0 * V
 
@@ -150,8 +156,17 @@ class Scanner:
             return np.array(
                 [[-self.d_SD / self.p_u, 0.0, self.u_0], [0.0, self.d_SD / self.p_v, self.v_0], [0.0, 0.0, 1.0]]
             )
-        M = np.linalg.inv(np.column_stack(self.panel))
-        return M / np.linalg.norm(M[2])
+        # the axes of the panel are the columns r of R: along the third, y_3 = r_3 . x_S is 1 in every pixel
+        R = self._panel_axes
+        (r_1, r_2, r_3), R_3 = R.T, R[2]
+        in_u, in_v = self.d_SD / self.p_u, self.d_SD / self.p_v
+        return np.array(
+            [
+                (self.u_0 + in_u * R_3[0]) * r_3 - in_u * R_3[2] * r_1,
+                (self.v_0 - in_v * R_3[1]) * r_3 + in_v * R_3[2] * r_2,
+                r_3,
+            ]
+        )
 
     @property
     def P_S(self) -> Array:

@@ -153,10 +153,12 @@ def adjusted_scanners(scanners: tuple[Scanner, ...], free: FreeParameters, delta
     result = []
     for r, scanner in enumerate(scanners):
         change: dict[str, Any] = {}
-        for j in range(len(free)):
-            name = SCANNER_COLUMNS[free.cols[j]]
-            if free.col_run[j] in (-1, r) and name != "translation_scale":
-                change[name] = change.get(name, getattr(scanner, name)) + free.factor[j] * delta[j]
+        for column, run, off in zip(
+            free.cols.tolist(), free.col_run.tolist(), (free.factor * delta).tolist(), strict=True
+        ):
+            name = SCANNER_COLUMNS[column]
+            if run in (-1, r) and name != "translation_scale":
+                change[name] = change.get(name, getattr(scanner, name)) + off
         try:
             result.append(replace(scanner, **change) if change else scanner)
         except InputError as error:
@@ -166,4 +168,4 @@ def adjusted_scanners(scanners: tuple[Scanner, ...], free: FreeParameters, delta
 
 def translation_scale(free: FreeParameters, delta: Array) -> float:
     """The estimated scale of the manipulator's translations, 1 where it was held."""
-    return 1.0 + sum(float(delta[j]) for j in range(len(free)) if free.names[j] == "translation_scale")
+    return 1.0 + sum(float(d) for n, d in zip(free.names, delta, strict=True) if n == "translation_scale")

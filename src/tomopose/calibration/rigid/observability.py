@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 
 import numpy as np
+import numpy.typing as npt
 
 from tomopose.calibration.model.parameters import MATTERS, FreeParameters, base_name, unit_of
 from tomopose.calibration.model.problem import Problem
@@ -61,6 +62,7 @@ def scales(names: tuple[str, ...]) -> Array:
     )
 
 
+@functools.cache
 def useless(names: tuple[str, ...]) -> Array:
     """(m,) standard uncertainty beyond which a coordinate counts as unknown."""
     return np.array(
@@ -94,10 +96,15 @@ def _group(name: str) -> str:
     return "the places of the balls" if name.startswith("t[") else "t" if name.startswith("t_") else base_name(name)
 
 
+def _shown(names: tuple[str, ...], v: Array) -> npt.NDArray[np.int64]:
+    """Places of the coordinates that name a direction."""
+    size = np.abs(v) / scales(names)
+    return np.flatnonzero(size >= SHOWN * size.max())
+
+
 def _words(names: tuple[str, ...], v: Array) -> str:
     """A direction as "t_HT_x + 0.9 d_SR", or as the groups that move together where it has many coordinates."""
-    size = np.abs(v / scales(names))
-    terms = [(n, x) for n, x, s in zip(names, v, size, strict=True) if s >= SHOWN * size.max()]
+    terms = [(names[j], float(v[j])) for j in _shown(names, v)]
     if len(terms) > MOST_TERMS:
         groups = list(dict.fromkeys(_group(n) for n, _ in terms))
         return f"{', '.join(groups[:-1])} and {groups[-1]} together" if len(groups) > 1 else f"{groups[0]} together"
@@ -108,26 +115,19 @@ def _words(names: tuple[str, ...], v: Array) -> str:
 def unobservable_directions(J: Array, names: tuple[str, ...]) -> tuple[Array, list[Array]]:
     """(singular values, directions (m,)) that the whitened Jacobian J (k, m) cannot determine to any use."""
     s, V = singular_values(J)
-    bad = []
-    limits = useless(names)
-    for s_k, v in zip(s, V, strict=True):
-        # v moved by one standard deviation changes the coordinates by v / s_k
-        if s_k <= SINGULAR * s[0] or (np.abs(v) / s_k > limits).any():
-            bad.append(v)
-    silent = [np.eye(len(names))[j] for j in np.flatnonzero(np.linalg.norm(J, axis=0) == 0)]
+    # v moved by one standard deviation changes the coordinates by v / s_k
+    far = (np.abs(V) > s[:, None] * useless(names)).any(axis=1)
+    bad = list(V[(s <= SINGULAR * s[0]) | far])
+    silent = [np.eye(len(names))[j] for j in np.flatnonzero(~J.any(axis=0))]
     return s, bad + silent
 
 
 def direction_and_remedy(problem: Problem, names: tuple[str, ...], v: Array) -> tuple[str, str]:
     """(direction in words, what would fix it)."""
     words = _words(names, v)
-    size = np.abs(v) / scales(names)
-    main = {base_name(n) for n, x in zip(names, size, strict=True) if x >= SHOWN * size.max()}
-    ball = [j for j, n in enumerate(names) if n.startswith(("t_x", "t_y", "t_z", "t["))]
-    moved = v[ball].reshape(-1, 3)
-    still = np.ptp(problem.alpha) == 0.0
-    scanner_names = main & set(MATTERS)
-    if scanner_names and still:
+    main = {base_name(names[j]) for j in _shown(names, v)}
+    scanner_names = main & MATTERS.keys()
+    if scanner_names and np.ptp(problem.alpha) == 0.0:
         return (
             f"{words}: exactly or nearly degenerate while the table stays at one angle",
             "add poses at another table angle, or give a prior standard deviation",
@@ -136,7 +136,9 @@ def direction_and_remedy(problem: Problem, names: tuple[str, ...], v: Array) -> 
         return f"{words}: only the ratio of lengths is visible", "give a prior on translation_scale or on d_SR"
     if scanner_names:
         return f"{words}: these poses cannot distinguish them", "add compound rotations, table angles, or a prior"
-    if len(moved) and np.abs(moved).max() >= SHOWN * size.max():
+    ball = [j for j, n in enumerate(names) if n.startswith(("t_x", "t_y", "t_z", "t["))]
+    moved = v[ball].reshape(-1, 3)
+    if len(moved) and np.abs(moved).max() >= SHOWN * np.abs(v / scales(names)).max():
         axis = moved[np.abs(moved).max(axis=1).argmax()]
         axis = np.round(axis / np.linalg.norm(axis) * (np.sign(axis[np.abs(axis).argmax()]) or 1.0), 2) + 0.0
         where = f"({axis[0]:.2f}, {axis[1]:.2f}, {axis[2]:.2f})"
