@@ -181,8 +181,12 @@ class Scanner:
     @property
     def table_axis(self) -> RigidTransform:
         """A map of W onto itself that takes the z axis to the real table axis; the identity for the paper's setup."""
-        R = R_x(self.axis_tilt_x) @ R_y(self.axis_tilt_y)
-        return RigidTransform.of_rotations(R, np.array([0.0, self.axis_y, 0.0]), Frame.W, Frame.W)
+        return RigidTransform.of_rotations(*self._axis, Frame.W, Frame.W)
+
+    @property
+    def _axis(self) -> tuple[Array, Array]:
+        """R (3, 3) and t (3,) of `table_axis`."""
+        return R_x(self.axis_tilt_x) @ R_y(self.axis_tilt_y), np.array([0.0, self.axis_y, 0.0])
 
     def T_TW(self, alpha: Array | float) -> RigidTransform:
         """Table to world at table angle alpha (rad): a turn about the table axis, the identity at 0.  Paper sec. 3."""
@@ -191,9 +195,9 @@ class Scanner:
             raise InputError("table angles hold values that are not finite")
         if self.axis_y == self.axis_tilt_x == self.axis_tilt_y == 0.0:
             return RigidTransform.of_rotations(R_z(alpha), np.zeros((*alpha.shape, 3)), Frame.T, Frame.W)
-        axis = self.table_axis
-        R = axis.R @ R_z(alpha) @ axis.R.T
-        return RigidTransform.of_rotations(R, axis.t - R @ axis.t, Frame.T, Frame.W)
+        A, t = self._axis
+        R = A @ R_z(alpha) @ A.T
+        return RigidTransform.of_rotations(R, t - R @ t, Frame.T, Frame.W)
 
     def binned(self, factor: int) -> Scanner:
         """The scanner of images averaged over factor x factor pixels.

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from tomopose.calibration.model.covariance import median
 from tomopose.calibration.model.problem import Problem
-from tomopose.geometry.scanner import Scanner
+from tomopose.geometry.scanner import R_WS, Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
 
@@ -54,12 +54,13 @@ class Cameras:
         first = which[0]
         for r, scanner in enumerate(scanners):
             mine = run == r
-            T_TS = scanner.T_WS @ scanner.T_TW(alpha[mine])
-            to_S = np.concatenate([T_TS.R, T_TS.t[:, :, None]], axis=2)
+            T_TW = scanner.T_TW(alpha[mine])
+            to_S = R_WS @ np.concatenate([T_TW.R, T_TW.t[:, :, None]], axis=2)
+            to_S[:, 2, 3] += scanner.d_SR
             P[mine], beams[mine] = scanner.K @ to_S, to_S[:, 2]
             if r == run[first]:
-                own = int(first - np.flatnonzero(mine)[0])
-                source = -T_TS.R[own].T @ T_TS.t[own]
+                own = to_S[first - np.flatnonzero(mine)[0]]
+                source = -own[:, :3].T @ own[:, 3]
         d_SR = np.array([s.d_SR for s in scanners])[run][which]
         return cls(at_angle=P, beams=beams, alpha=alpha, run=run, which=which, d_SR=d_SR, source=source)
 

@@ -133,13 +133,18 @@ def blocks(problem: Problem, free: FreeParameters, fit: Fit) -> ProjectionBlocks
 
 def jacobian(problem: Problem, free: FreeParameters, b: ProjectionBlocks) -> Array:
     """(n, 2, m): derivatives of the calculated centres by w_HT, t_HT, the balls and the freed parameters, px."""
-    n, ball, free_from = len(problem), 6 + 3 * problem.ball, 6 + 3 * len(problem.ball_ids)
+    n, free_from = len(problem), 6 + 3 * len(problem.ball_ids)
     J = np.zeros((n, 2, free_from + len(free)))
     J[:, :, :3], J[:, :, 3:6] = b.J_w_HT, b.J_t_HT
-    column = ball[:, None] + np.arange(3)
-    np.put_along_axis(J, np.broadcast_to(column[:, None, :], (n, 2, 3)), b.J_t, axis=2)
-    mine = (free.col_run[None, :] < 0) | (free.col_run[None, :] == problem.run[:, None])
-    J[:, :, free_from:] = b.J_scanner[:, :, free.cols] * free.factor * mine[:, None, :]
+    if len(problem.ball_ids) == 1:
+        J[:, :, 6:9] = b.J_t
+    else:
+        column = 6 + 3 * problem.ball[:, None] + np.arange(3)
+        np.put_along_axis(J, np.broadcast_to(column[:, None, :], (n, 2, 3)), b.J_t, axis=2)
+    J[:, :, free_from:] = b.J_scanner[:, :, free.cols] * free.factor
+    if (free.col_run >= 0).any():
+        mine = (free.col_run[None, :] < 0) | (free.col_run[None, :] == problem.run[:, None])
+        J[:, :, free_from:] *= mine[:, None, :]
     return J
 
 

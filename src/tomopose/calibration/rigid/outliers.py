@@ -25,6 +25,9 @@ FALSE_ALARM = 0.01
 LARGEST_SHARE = 0.2
 """Should more of the poses fail than this share, they are not outliers: the model does not fit, and all are kept."""
 
+LEAST_SHARE = 0.01
+"""Of a row's covariance that its residual keeps, in any direction."""
+
 MEDIAN_CHI2_2 = 2.0 * math.log(2.0)
 REWEIGHTINGS = 40
 RECLASSIFICATIONS = 8
@@ -68,11 +71,19 @@ def studentised(problem: Problem, fit: Fit, keep: npt.NDArray[np.bool_], x_calc:
     r = problem.x_D - x_calc
     spread = J @ inverse_information(fit.N) @ np.swapaxes(J, 1, 2)
     V = problem.covariance + np.where(keep[:, None, None], -spread, spread)
+    V = problem.W @ V @ np.swapaxes(problem.W, 1, 2)
+    y_0, y_1 = (problem.W @ r[:, :, None])[..., 0].T
+    a, b, c = V[:, 0, 0], V[:, 0, 1], V[:, 1, 1]
+    det = a * c - b * b
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = (c * y_0 * y_0 - 2.0 * b * y_0 * y_1 + a * y_1 * y_1) / det
     # a row that the fit follows entirely has no residual of its own: floor at one per cent of its covariance
-    value, Q = np.linalg.eigh(problem.W @ V @ np.swapaxes(problem.W, 1, 2))
-    z = (np.swapaxes(Q, 1, 2) @ (problem.W @ r[:, :, None]))[..., 0]
-    result: Array = (z**2 / np.maximum(value, 0.01)).sum(axis=1)
-    return result
+    low = np.flatnonzero(~((a > LEAST_SHARE) & ((a - LEAST_SHARE) * (c - LEAST_SHARE) > b * b)))
+    if len(low):
+        value, Q = np.linalg.eigh(V[low])
+        z = (np.swapaxes(Q, 1, 2) @ np.stack([y_0[low], y_1[low]], axis=1)[:, :, None])[..., 0]
+        found[low] = (z**2 / np.maximum(value, LEAST_SHARE)).sum(axis=1)
+    return found
 
 
 def _scale(distance2: Array) -> float:
