@@ -13,6 +13,8 @@ from calibration_cases import BALL, MOUNT, SCANNER, mixed_poses, observe, paper_
 import tomopose as tp
 from tomopose.calibration.model.budget import budget_words
 from tomopose.calibration.result import Calibration
+from tomopose.geometry.rotations import log_rotation
+from tomopose.manipulator.virtual import typical_hexapod
 
 SILENT = replace(SCANNER, sigma={})
 
@@ -64,11 +66,11 @@ def test_a_closing_pose_that_is_off_is_never_silent(shared_data):
 
 def test_certificate_sigmas_with_the_table_still_give_a_result(shared_data):
     cal, _ = case(shared_data / "cases" / "calibrate-crash")
-    # 0.002 px if everything assumed were exact, 1.1 px as it is: a scan of which nobody can trust a voxel
+    # 0.002 px if everything assumed were exact, 1.4 px as it is: a scan of which nobody can trust a voxel
     assert cal.verdict == "doubtful"
     assert cal.budget.measured < 0.01
     assert cal.budget.total > 1.0
-    assert any("1.1 px" in r and "u_0 (1 px assumed)" in r and "Two table angles" in r for r in cal.reasons)
+    assert any("1.4 px" in r and "u_0 (1 px assumed)" in r and "Two table angles" in r for r in cal.reasons)
     assert {a.name: a.source for a in cal.assumed}["d_SR"] == "scanner.json"
 
 
@@ -238,6 +240,43 @@ def test_the_scale_of_a_robot_is_in_every_sigma_unless_it_is_stated():
     assert exact.budget.total < stated.budget.total < 0.2 * silent.budget.total
     u = {n: {p.name: p.u for p in c.parameters} for n, c in (("silent", silent), ("exact", exact))}
     assert u["silent"]["t_x"] > 2 * u["exact"]["t_x"]
+
+
+def test_a_platform_of_which_nothing_is_stated_has_the_scales_of_one_as_delivered():
+    """Joints known to 0.01 mm make the default scales; who states every value of the scanner has better ones."""
+    axes, ids = np.eye(3), [str(k) for k in range(12)]
+    both = np.concatenate([np.repeat(axes, 2, axis=0) * np.tile([[1.0], [-1.0]], (3, 1))])
+    poses = tp.PoseSequence.from_table(
+        np.concatenate([10.0 * both, np.zeros((6, 3))]), np.concatenate([np.zeros((6, 3)), 5.0 * both]), pose_id=ids
+    )
+    machine = replace(typical_hexapod(), leg_sigma=0.0, scale_sigma=0.0, geometry_sigma=0.0)
+    rng = np.random.default_rng(5)
+    shifts, turns = [], []
+    for _ in range(200):
+        real = machine.real_poses(poses, 0.01 * rng.standard_normal(len(machine.names))).T_MH
+        shifts.append([(real.t[2 * i] - real.t[2 * i + 1])[i] / 20.0 - 1.0 for i in range(3)])
+        apart = real.R[6::2] @ np.swapaxes(real.R[7::2], 1, 2)
+        turns.append(np.diag(log_rotation(apart)) / np.radians(10.0) - 1.0)
+    poses = mixed_poses(n=40)
+    seen = observe(poses)
+    silent, stated = (tp.calibrate(s, poses, seen) for s in (SILENT, SILENT.exact()))
+    delivered = dict(zip(silent.unseen.names, silent.unseen.sigma, strict=True))
+    measured = dict(zip(stated.unseen.names, stated.unseen.sigma, strict=True))
+    assert delivered["scale_of_translations"] == pytest.approx(np.std(np.mean(shifts, axis=1)), rel=0.2)
+    assert delivered["rotation_scale_x"] == pytest.approx(np.sqrt(np.mean(np.square(turns))), rel=0.2)
+    assert measured["scale_of_translations"] < 0.1 * delivered["scale_of_translations"]
+    assert measured["rotation_scale_x"] < 0.2 * delivered["rotation_scale_x"]
+
+
+def test_an_axis_that_no_image_shows_and_nobody_stated_keeps_the_verdict_from_trustworthy():
+    poses = paper_poses()
+    silent = tp.calibrate(SILENT, poses, observe(poses))
+    assert silent.verdict == "doubtful"
+    assert any("axis_y" in r and "no sigma given" in r for r in silent.reasons)
+    # a user who knows the axis states it
+    stated = tp.calibrate(replace(SILENT, sigma={"axis_y": 0.01}), poses, observe(poses))
+    assert stated.verdict == "trustworthy"
+    assert stated.budget.total < silent.budget.total
 
 
 def test_halves_of_the_poses_differ_by_what_is_stated_and_by_more_where_the_model_is_wrong():

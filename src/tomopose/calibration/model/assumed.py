@@ -31,7 +31,7 @@ class Default:
 _DISTANCES = "makers state distances to some tenths of a mm: Ferrucci et al., Meas. Sci. Technol. 26 (2015) 092003"
 _PITCH = "glass expands by 3e-6 to 8e-6 a kelvin, and data sheets print pitches with four digits"
 _HALF_PIXEL = "half a pixel lies between counting from the corner and from the centre of a pixel"
-_OFFSET = "a table set by dial gauge: some hundredths of a mm; tuned on benchmarks/reality, where 0.04 is too small"
+_OFFSET = "a table set by dial gauge, to some hundredths of a mm; tuned on benchmarks/reality"
 _AXIS = "the axis defines W; what is left of its alignment after a search for the centre of rotation"
 
 DEFAULTS: Mapping[str, Default] = MappingProxyType(
