@@ -17,14 +17,13 @@ from tomopose.units import Array
 @dataclass(frozen=True, kw_only=True)
 class Cameras:
     """at_angle (k, 3, 4): from T to pixels, of every run at each of its table angles;  beams (k, 4): direction of the
-    beam in T and offset, which give a point's distance from the focal spot along it, mm;  alpha (k,) rad, run (k,): of
-    these;  which (n,): the one of every row;  d_SR (n,) mm;  source (3,): where the source is in T in the first pose,
-    mm."""
+    beam in T and offset, which give a point's distance from the focal spot along it, mm;  alpha: the table angles of
+    every run, rad;  which (n,): the place in these of every row;  d_SR (n,) mm;  source (3,): where the source is in T
+    in the first pose, mm."""
 
     at_angle: Array
     beams: Array
-    alpha: Array
-    run: npt.NDArray[np.int64]
+    alpha: tuple[Array, ...]
     which: npt.NDArray[np.int64]
     d_SR: Array
     source: Array
@@ -40,33 +39,22 @@ class Cameras:
             run.append(np.full(len(angles), r))
             which[mine] = k + place.reshape(-1)
             k += len(angles)
-        return cls._seen(problem.scanners, np.concatenate(alpha), np.concatenate(run), which)
+        to_S = [_table_to_source(s, a) for s, a in zip(problem.scanners, alpha, strict=True)]
+        first = np.concatenate(to_S)[which[0]]
+        runs = np.concatenate(run)
+        return cls(
+            at_angle=np.concatenate([s.K @ T for s, T in zip(problem.scanners, to_S, strict=True)]),
+            beams=np.concatenate([T[:, 2] for T in to_S]),
+            alpha=tuple(alpha),
+            which=which,
+            d_SR=np.array([s.d_SR for s in problem.scanners])[runs][which],
+            source=-first[:, :3].T @ first[:, 3],
+        )
 
-    @classmethod
-    def _seen(
-        cls,
-        scanners: tuple[Scanner, ...],
-        alpha: Array,
-        run: npt.NDArray[np.int64],
-        which: npt.NDArray[np.int64],
-    ) -> Cameras:
-        P, beams, source = np.empty((len(alpha), 3, 4)), np.empty((len(alpha), 4)), np.zeros(3)
-        first = which[0]
-        for r, scanner in enumerate(scanners):
-            mine = run == r
-            T_TW = scanner.T_TW(alpha[mine])
-            to_S = R_WS @ np.concatenate([T_TW.R, T_TW.t[:, :, None]], axis=2)
-            to_S[:, 2, 3] += scanner.d_SR
-            P[mine], beams[mine] = scanner.K @ to_S, to_S[:, 2]
-            if r == run[first]:
-                own = to_S[first - np.flatnonzero(mine)[0]]
-                source = -own[:, :3].T @ own[:, 3]
-        d_SR = np.array([s.d_SR for s in scanners])[run][which]
-        return cls(at_angle=P, beams=beams, alpha=alpha, run=run, which=which, d_SR=d_SR, source=source)
-
-    def with_scanners(self, scanners: tuple[Scanner, ...]) -> Cameras:
-        """The same table angles seen by scanners with other values."""
-        return self._seen(scanners, self.alpha, self.run, self.which)
+    def seen_by(self, scanners: tuple[Scanner, ...]) -> Array:
+        """(k, 3, 4): `at_angle` of scanners with other values."""
+        each = [s.K @ _table_to_source(s, a) for s, a in zip(scanners, self.alpha, strict=True)]
+        return each[0] if len(each) == 1 else np.concatenate(each)
 
     @property
     def P(self) -> Array:
@@ -77,6 +65,15 @@ class Cameras:
     def beam(self) -> Array:
         """(n, 4): the beam of every row."""
         return np.asarray(self.beams[self.which])
+
+
+def _table_to_source(scanner: Scanner, alpha: Array) -> Array:
+    """(k, 3, 4): from T to S at table angles (k,)."""
+    T_TW = scanner.T_TW(alpha)
+    T = np.empty((len(alpha), 3, 4))
+    T[:, :, :3], T[:, :, 3] = R_WS @ T_TW.R, T_TW.t @ R_WS.T
+    T[:, 2, 3] += scanner.d_SR
+    return T
 
 
 def chain_matrices(problem: Problem, scanners: tuple[Scanner, ...], T_HT: RigidTransform) -> Array:
@@ -96,9 +93,11 @@ def silhouette_outlines(P: Array, centres: Array, diameter: float, which: npt.ND
     """
     M = P[:, :, :3]
     B = (diameter / 2.0) ** 2 * (M @ np.swapaxes(M, 1, 2))
-    if which is not None:
-        P, B = P[which], B[which]
-    y = (P[:, :, :3] @ centres[:, :, None])[..., 0] + P[:, :, 3]
+    if which is None:
+        y = (M @ centres[:, :, None])[..., 0] + P[:, :, 3]
+    else:
+        B = B[which]
+        y = (centres @ np.swapaxes(M, 1, 2) + P[:, None, :, 3])[which, np.arange(len(which))]
     a, b, c = y.T
     B_aa, B_ab, B_ac, B_bb, B_bc, B_cc = (B[:, i, j] for i, j in _UPPER)
     scale = 1.0 / (c * c - B_cc)

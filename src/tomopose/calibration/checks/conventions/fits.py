@@ -75,8 +75,10 @@ def size_ratio(problem: Problem, free: FreeParameters, fit: Fit, x_T: Array, cam
             scanners = adjusted_scanners(problem.scanners, free, fit.delta)
         except ImpossibleScannerError:  # a wrong reading may end anywhere
             return float("nan")
-        cameras = cameras.with_scanners(scanners)
-    found = size_ratio_of(problem, cameras.at_angle, x_T, which=cameras.which)
+        P = cameras.seen_by(scanners)
+    else:
+        P = cameras.at_angle
+    found = size_ratio_of(problem, P, x_T, which=cameras.which)
     return float("nan") if found is None else found
 
 
