@@ -123,7 +123,7 @@ def run_tests(
     singles = tuple(Single(name=n, short=n, kind=k, evidence=60.0, size=s) for n, k, s in equal)
 
     def ranked(chosen: tuple[Explanation, ...]) -> Ranked:
-        return Ranked(chosen=chosen, first=chosen, single=singles, chi2=400.0, left=370.0, dof=370)
+        return Ranked(chosen=chosen, single=singles, chi2=400.0, left=370.0, dof=370)
 
     beside = ranked(() if left is None else (left,))
     return ScannerTests(beside=beside, declared=ranked(()), gain=60.0, sigma={"d_SR": 0.15})

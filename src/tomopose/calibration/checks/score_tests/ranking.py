@@ -39,8 +39,8 @@ thousand, and an effect of 5 sigma in one coordinate, with 189 poses and 40 look
 EQUAL = 3.0
 """Explanations within this evidence of the best are named beside it."""
 
-MOST, LISTED = 4, 3
-"""Explanations that are taken one after the other; single ones that are listed."""
+MOST = 4
+"""Explanations that are taken one after the other."""
 
 TIE = 1e-6
 """Evidences that differ by less are equal: rounding alone would decide which is named first."""
@@ -209,11 +209,9 @@ class Single:
 @dataclass(frozen=True, kw_only=True)
 class Ranked:
     """single: every effect on its own, likeliest first;  chosen: explanations in the order in which they were taken,
-    decisive ones only;  first: the likeliest single ones, explained;  chi2, left: before and after the chosen ones;
-    dof."""
+    decisive ones only;  chi2, left: before and after the chosen ones;  dof."""
 
     chosen: tuple[Explanation, ...]
-    first: tuple[Explanation, ...]
     single: tuple[Single, ...]
     chi2: float
     left: float
@@ -232,7 +230,6 @@ def ranked_explanations(
     fit = white
     looks = len(columns) + len(steps)
     chosen: list[Explanation] = []
-    first: tuple[Explanation, ...] = ()
     single: tuple[Single, ...] = ()
     total = left = 0.0
     dof = 0
@@ -250,15 +247,14 @@ def ranked_explanations(
                 Single(name=c.effect.name, short=c.effect.short, kind=c.effect.kind, evidence=c.evidence, size=c.size)
                 for c in candidates
             )
-            first = tuple(_explain(c, candidates, problem, white, left) for c in candidates[:LISTED])
         if not candidates or candidates[0].evidence < DECISIVE:
             break
         best = candidates[0]
-        found = first[0] if turn == 0 else _explain(best, candidates, problem, white, left)
+        found = _explain(best, candidates, problem, white, left)
         C = best.columns()
         chosen.append(replace(found, predicts=_predicts(fit, C)))
         white = white.with_columns(C)
-    return Ranked(chosen=tuple(chosen), first=first, single=single, chi2=total, left=left, dof=dof)
+    return Ranked(chosen=tuple(chosen), single=single, chi2=total, left=left, dof=dof)
 
 
 def _explain(
