@@ -31,7 +31,6 @@ class Default:
 _DISTANCES = "makers state distances to some tenths of a mm: Ferrucci et al., Meas. Sci. Technol. 26 (2015) 092003"
 _PITCH = "glass expands by 3e-6 to 8e-6 a kelvin, and data sheets print pitches with four digits"
 _HALF_PIXEL = "half a pixel lies between counting from the corner and from the centre of a pixel"
-_OFFSET = "a table set by dial gauge, to some hundredths of a mm; tuned on benchmarks/reality"
 _AXIS = "the axis defines W; what is left of its alignment after a search for the centre of rotation"
 
 DEFAULTS: Mapping[str, Default] = MappingProxyType(
@@ -45,7 +44,7 @@ DEFAULTS: Mapping[str, Default] = MappingProxyType(
         "eta": Default(sigma=1e-3, source="0.06 degrees, what a machinist's level shows of a panel"),
         "theta": Default(sigma=2e-3, source="0.1 degrees: 0.8 mm over a panel of 400 mm"),
         "phi": Default(sigma=2e-3, source="0.1 degrees: 0.8 mm over a panel of 400 mm"),
-        "axis_y": Default(sigma=0.05, source=_OFFSET),
+        "axis_y": Default(sigma=0.02, source=_AXIS),
         "axis_tilt_x": Default(sigma=2e-4, source=_AXIS),
         "axis_tilt_y": Default(sigma=2e-4, source=_AXIS),
     }
