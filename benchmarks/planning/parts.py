@@ -11,17 +11,21 @@ import tomopose as tp
 from tomopose.measurement.mesh.mesh import Mesh
 from tomopose.measurement.plan import plan_from
 from tomopose.planning.part.part import Part
-from tomopose.simulation.objects.specimen import specimen_mesh
+from tomopose.simulation.objects.specimen import CUBOID_HEIGHTS, FLANGE_RADIUS, FLAT, specimen_mesh
 
-SEGMENTS = 96
+SEGMENTS, N_POINTS = 96, 300
 
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A part with its plan, attenuation (1/mm), scanner's magnification and largest tilt (deg)."""
+    """A part with its plan, attenuation (1/mm), scanner's magnification and largest tilt (deg).
+
+    plan: what views are chosen and judged by; None for the whole surface;  lengths: what is measured in virtual scans.
+    """
 
     part: Part
     plan: tp.MeasurementPlan | None
+    lengths: tp.MeasurementPlan
     mu: float
     d_SR: float
     tilt: float
@@ -41,13 +45,13 @@ def _bore(radius: float, length: float, centre: tuple[float, float, float]) -> M
 
 
 def _plane(point: list[float], n: list[float], u: list[float], v: list[float]) -> dict[str, object]:
-    return {"kind": "plane", "point": point, "direction": n, "u": u, "v": v}
+    return {"kind": "plane", "point": point, "direction": n, "u": u, "v": v, "n_points": N_POINTS}
 
 
 def _cylinder(point: list[float], radius: float, length: float, *, inward: bool = True) -> dict[str, object]:
     axis = [0, 0, 1]
     shape = {"kind": "cylinder", "point": point, "direction": axis, "radius_mm": radius, "length_mm": length}
-    return {**shape, "inward": inward}
+    return {**shape, "inward": inward, "n_points": N_POINTS}
 
 
 def _plan(features: dict[str, object], distances: list[tuple[str, str]]) -> tp.MeasurementPlan:
@@ -75,9 +79,11 @@ def plate() -> Case:
         radius = 3 + 0.5 * k
         solid -= _bore(radius, 10, (x, y, 0))
         features[f"bore {k}"] = _cylinder([x, y, 0], radius, 4)
+    plan = _plan(features, [("top", "bottom"), ("left", "right")])
     return Case(
         part=_part("plate", solid),
-        plan=_plan(features, [("top", "bottom"), ("left", "right")]),
+        plan=plan,
+        lengths=plan,
         mu=0.06,
         d_SR=400.0,
         tilt=20.0,
@@ -97,7 +103,8 @@ def bracket() -> Case:
         "bore": _cylinder([6, 0, -12], 4, 6),
         "side bore": {**side, "inward": True},
     }
-    return Case(part=_part("bracket", solid), plan=_plan(features, [("foot", "sole")]), mu=0.06, d_SR=400.0, tilt=15.0)
+    plan = _plan(features, [("foot", "sole")])
+    return Case(part=_part("bracket", solid), plan=plan, lengths=plan, mu=0.06, d_SR=400.0, tilt=15.0)
 
 
 def tall_box() -> Case:
@@ -111,7 +118,8 @@ def tall_box() -> Case:
         "inner": _plane([4.5, 0, 0], [-1, 0, 0], [0, 4, 0], [0, 0, 25]),
     }
     distances = [("floor", "sole"), ("left", "right"), ("inner", "right")]
-    return Case(part=_part("tall box", solid), plan=_plan(features, distances), mu=0.08, d_SR=420.0, tilt=15.0)
+    plan = _plan(features, distances)
+    return Case(part=_part("tall box", solid), plan=plan, lengths=plan, mu=0.08, d_SR=420.0, tilt=15.0)
 
 
 def blade() -> Case:
@@ -120,14 +128,33 @@ def blade() -> Case:
     profile = np.column_stack([11 * np.cos(angle), 1.6 * np.sin(angle) + 1.5 * np.cos(angle) ** 2])
     wing = CrossSection([profile.tolist()]).extrude(30, 24, 35.0, (0.7, 0.9))
     solid = wing.translate((0, 0, -10)) + _box((26, 10, 6), (0, 0.5, -12))
-    return Case(part=_part("blade", solid), plan=None, mu=0.1, d_SR=380.0, tilt=15.0)
+    block: dict[str, object] = {
+        "left": _plane([-13, 0.5, -12], [-1, 0, 0], [0, 4.5, 0], [0, 0, 2.5]),
+        "right": _plane([13, 0.5, -12], [1, 0, 0], [0, 4.5, 0], [0, 0, 2.5]),
+        "front": _plane([0, -4.5, -12], [0, -1, 0], [12, 0, 0], [0, 0, 2.5]),
+        "back": _plane([0, 5.5, -12], [0, 1, 0], [12, 0, 0], [0, 0, 2.5]),
+    }
+    lengths = _plan(block, [("left", "right"), ("front", "back")])
+    return Case(part=_part("blade", solid), plan=None, lengths=lengths, mu=0.1, d_SR=380.0, tilt=15.0)
 
 
 def specimen() -> Case:
     """The paper's specimen (sec. 6.2), coarsely meshed, without features: the whole surface counts."""
     mesh = specimen_mesh(edge=4.0, segments=48)
     part = Part(mesh=Mesh(points=mesh.vertices, faces=np.asarray(mesh.faces)), name="specimen")
-    return Case(part=part, plan=None, mu=0.06, d_SR=420.0, tilt=8.0)
+    features: dict[str, object] = {
+        "lower flange": _cylinder([0, 0, -24], FLANGE_RADIUS, 10, inward=False),
+        "upper flange": _cylinder([0, 0, 24], FLANGE_RADIUS, 10, inward=False),
+    }
+    for k in (1, 3, 5):
+        c, s, side = np.cos(k * np.pi / 3), np.sin(k * np.pi / 3), 1 if k % 2 else -1
+        out, along, up = np.array([c, s, 0.0]), [-3 * s, 3 * c, 0.0], [0.0, 0.0, 1.0]
+        outer = (FLAT + CUBOID_HEIGHTS[k]) * out + np.array([0.0, 0.0, 9.0 * side])
+        flat = FLAT * out - np.array([0.0, 0.0, 7.0 * side])
+        features[f"flat {k}"] = _plane(flat.tolist(), out.tolist(), along, [8 * w for w in up])
+        features[f"cuboid {k}"] = _plane(outer.tolist(), out.tolist(), [0.75 * w for w in along], [3.5 * w for w in up])
+    lengths = _plan(features, [(f"flat {k}", f"cuboid {k}") for k in (1, 3, 5)])
+    return Case(part=part, plan=None, lengths=lengths, mu=0.06, d_SR=420.0, tilt=8.0)
 
 
 CASES = {"plate": plate, "bracket": bracket, "tall box": tall_box, "blade": blade, "specimen": specimen}

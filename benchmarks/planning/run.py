@@ -1,7 +1,8 @@
 """How good planned scans are: certificates, the worth beside other paths, time, and lengths from virtual scans.
 
     python benchmarks/planning/run.py                   certificates and worth of five parts, time of a large one
-    python benchmarks/planning/run.py --images plate --views 24    virtual scans: errors of lengths by path
+    python benchmarks/planning/run.py --images --views 24 --draws 16    virtual scans: lengths and their uncertainty
+    python benchmarks/planning/run.py --images plate bracket            of some parts only
 
 Random paths are N of the candidates, the best of ten draws.  Judged on points that nothing was planned with, counting
 what leaves the view as if it did not: that favours the usual paths.
@@ -114,14 +115,16 @@ def large() -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", type=int, default=40)
-    parser.add_argument("--images", choices=[n for n, make in CASES.items() if make().plan], help="virtual scans only")
-    parser.add_argument("--draws", type=int, default=6, help="virtual scans of each path")
+    parser.add_argument(
+        "--images", nargs="*", choices=list(CASES), help="virtual scans only: of all parts, or of these"
+    )
+    parser.add_argument("--draws", type=int, default=16, help="virtual scans of each path")
     given = parser.parse_args()
-    if given.images:
-        from scans import compare
+    if given.images is not None:
+        from scans import compare_all
 
-        case = CASES[given.images]()
-        compare(case, setting(case, given.views), given.draws)
+        cases = {name: CASES[name]() for name in given.images or CASES}
+        compare_all({name: (case, setting(case, given.views)) for name, case in cases.items()}, given.draws)
     else:
         worth_table(given.views)
         large()

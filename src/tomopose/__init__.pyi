@@ -168,6 +168,8 @@ from .planning.design import DesignSettings as DesignSettings
 from .planning.design import PosePlan as PosePlan
 from .planning.design import plan_poses as plan_poses
 from .planning.limits import PlanLimits as PlanLimits
+from .planning.plan_scan import ScanPlan as ScanPlan
+from .planning.plan_scan import plan_scan as plan_scan
 from .planning.resolve import Resolvability as Resolvability
 from .provenance import Provenance as Provenance
 from .reconstruction.line_integrals import Correction as Correction

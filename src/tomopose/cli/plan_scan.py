@@ -67,7 +67,8 @@ class PartOptions:
     scanner: Annotated[Path | None, typer.Option("--scanner", help="scanner.json; else the calibration's.")] = None
     material: Annotated[str | None, typer.Option("--material", help="What the part is made of, such as Al.")] = None
     mu: Annotated[
-        float | None, typer.Option("--mu-per-mm", help="Attenuation of the part, 1/mm, in place of --material.")
+        float | None,
+        typer.Option("--mu-per-mm", help="Attenuation of the part as a volume shows it, 1/mm, in place of --material."),
     ] = None
     kv: Annotated[
         float | None,
@@ -103,6 +104,12 @@ class PartOptions:
         float, typer.Option("--quanta", help="X-ray quanta in an open pixel, for the predicted uncertainty.")
     ] = 20_000.0
     blur: Annotated[float, typer.Option("--blur-px", help="Standard width of the unsharpness at the panel.")] = 0.5
+    sweeps: Annotated[
+        int, typer.Option("--sweeps", min=1, help="Sweeps of SART that the predicted uncertainty is for.")
+    ] = 1
+    room: Annotated[
+        float, typer.Option("--room-mm", help="By how much the reconstructed box exceeds the part on each side.")
+    ] = 5.0
     manipulator: Annotated[
         Path | None, typer.Option("--manipulator", help="hexapod.json: its legs have to stay within their stroke.")
     ] = None
@@ -235,6 +242,8 @@ def _settings(o: Options, mu: float) -> PartSettings:
         margin=o.margin,
         quanta=o.quanta,
         blur=o.blur,
+        sweeps=o.sweeps,
+        room=o.room,
         seed=o.seed,
     )
 

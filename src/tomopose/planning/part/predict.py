@@ -1,42 +1,51 @@
-"""The standard uncertainty of each feature that a set of views lets expect.
+"""The standard uncertainty of features and lengths that the noise of a set of views lets expect.
 
-A ray that grazes the surface at x_i with incidence g_ij = |n . d| sees a shift delta along the normal as a change
-mu delta / g_ij of the line integral, whose variance is
+Noise moves each edge (`expected_edges`), the feature's least-squares fit takes the edges to its parameters, and the
+measurand takes these to a length:
 
-    var_ij = 1 / (N_0 tau_ij) + (r / (N_0 tau_ij))^2
+    d length = sum_f (d length / d vector_f) D_f e_f,      e_i = sum_k L_ik g_ik
 
-with N_0 quanta of an open pixel and readout noise r.  g is at least s_0 = max(sqrt(w / 2 R), w / l): the ray has a
-width w at the object, the surface a radius R or a length l.  A patch of area a is crossed by a g / w^2 independent
-rays, so that the information on the position of the surface there, and that on the feature's parameters, are
-
-    I_i = sum_j (a g_ij / w^2) (mu / g_ij)^2 / var_ij        A = sum_i I_i J_i J_i^T
-
-This is a Cramer-Rao bound with all else known, therefore optimistic; ratios between sets of views are what it is good
-for.
+so that a length is one sum over grey levels of the volume, whose variance `SartResponse.covariance` gives with all
+correlation between voxels, points and the two features.  What it holds: the quanta and the readout, the views' geometry
+and transmission, blur, SART, the fit; and, with a calibration, its shared uncertainty.  What it does not hold: every
+systematic deviation (artefacts of few views and of the cone beam, beam hardening, scatter, sampling by voxels).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from tomopose.geometry.scanner import Scanner
-from tomopose.measurement.plan import MeasurandPlan
-from tomopose.planning.part.targets import Target
+from tomopose.measurement.alignment import Alignment
+from tomopose.measurement.features.feature import Feature
+from tomopose.measurement.features.shapes import frame_along
+from tomopose.measurement.measure import evaluate
+from tomopose.measurement.plan import MeasurandPlan, MeasurementPlan
+from tomopose.planning.part.expected_edges import FEWEST_EDGES, ExpectedEdges, expected_edges
+from tomopose.planning.part.sart_response import sart_response
+from tomopose.planning.part.targets import Target, probed_targets
 from tomopose.planning.part.worth import Goal, Views
 from tomopose.trajectory.completeness import source_path
 from tomopose.units import Array
 
-SINGULAR = 1e-12
+PROBED = 500
+"""Points of a feature at most: noise is alike over a voxel, and more points say nothing new."""
+SINGLE_POINTS = 24
+"""Of a surface without a shape, whose uncertainty is that of single points."""
+STEP = 1e-4
+"""mm and rad, of the differences that lengths are derived by."""
+PREDICTED = ("distance", "diameter")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Predicted:
     """u: mm, of the feature's position along its normal (the largest over the directions that it has);
     u_size: mm, of its radius, nan where it has none;  views: how many see it at a point, the median;
-    without_best: seen share if the view that shows most of it were lost."""
+    without_best: seen share if the view that shows most of it were lost.  u is inf where no edge is to be expected."""
 
     name: str
     seen_share: float
@@ -46,83 +55,195 @@ class Predicted:
     without_best: float
 
 
-def ray_width(scanner: Scanner, blur: float, depth: Array) -> Array:
-    """mm at the object: pixel and unsharpness (px), scaled to the depth."""
-    width: Array = np.hypot(1.0, 2 * blur) * scanner.p_u * depth / scanner.d_SD
-    return width
+def predicted(
+    goal: Goal,
+    scanner: Scanner,
+    P: Array,
+    views: Views,
+    *,
+    plan: MeasurementPlan | None = None,
+    shared: Array | None = None,
+) -> tuple[list[Predicted], dict[str, float]]:
+    """(each target, standard uncertainty in mm of each distance and diameter of the plan).
 
-
-def information(goal: Goal, scanner: Scanner, P: Array, views: Views, target: Target) -> Array:
-    """(m,) of the target's points, 1/mm^2."""
-    rows, s = goal.rows[target.name], goal.settings
-    tau = np.maximum(views.tau[:, rows].astype(np.float64), 1e-12)
-    depth = np.einsum("jc,mc->jm", P[:, 2, :3], target.x) + P[:, 2, 3:]
-    w = ray_width(scanner, s.blur, depth)
-    least = np.maximum(np.sqrt(w / (2 * target.radius)), w / target.length)
-    g = np.maximum(np.maximum(views.incidence[:, rows].astype(np.float64), least), 1e-4)
-    count = s.quanta * tau
-    var = 1 / count + (s.readout / count) ** 2
-    useful = tau >= s.least_transmission
-    return np.asarray((useful * target.area * s.mu**2 / (g * w**2 * var)).sum(axis=0))
-
-
-def predicted(goal: Goal, scanner: Scanner, P: Array, views: Views, *, shared: Array | None = None) -> list[Predicted]:
-    """Of each target.  shared: (targets,) mm, what the calibration adds to each, in quadrature."""
+    shared: (targets,) mm, what the calibration adds to the place of each, in quadrature.
+    """
+    u, sizes, lengths = _from_noise(goal, scanner, P, plan)
+    own = np.zeros(len(goal.targets)) if shared is None else shared
     out = []
     for k, target in enumerate(goal.targets):
         seen = views.A[:, goal.rows[target.name]] > 0
         times = seen.sum(axis=0)
-        u, u_size = _of_parameters(target, information(goal, scanner, P, views, target))
-        own = 0.0 if shared is None else float(shared[k])
         lonely = seen & (times == 1)
         out.append(
             Predicted(
                 name=target.name,
                 seen_share=float((times > 0).mean()),
-                u=float(np.hypot(u, own)),
-                u_size=u_size,
+                u=float(np.hypot(u[k], own[k])),
+                u_size=float(sizes[k]),
                 views=float(np.median(times)),
                 without_best=float((times > 0).mean() - lonely.mean(axis=1).max(initial=0.0)),
             )
         )
+    by = dict(zip((t.name for t in goal.targets), own, strict=True))
+    for m in _lengths(plan):
+        if m.kind == "distance":
+            lengths[m.name] = float(np.linalg.norm([lengths[m.name], *(by[f] for f in m.of)]))
+    return out, lengths
+
+
+def _from_noise(
+    goal: Goal, scanner: Scanner, P: Array, plan: MeasurementPlan | None
+) -> tuple[Array, Array, dict[str, float]]:
+    """(u of the place, u of the radius) (targets,) and of the lengths, mm, from the noise alone."""
+    wanted = _lengths(plan)
+    if plan is not None and plan.features:
+        goal = replace(goal, targets=probed_targets(plan, PROBED))
+    targets = goal.targets
+    depth = goal.part.hull @ P[:, 2, :3].T + P[:, 2, 3]
+    if not (depth > 0).all():
+        nothing = np.full(len(targets), np.inf)
+        return nothing, nothing, {m.name: np.inf for m in wanted}
+    response = sart_response(goal.part, scanner, P, goal.settings)
+    edges = expected_edges(response, goal.x, goal.n)
+    names, rows = list(goal.rows), []
+    for target in targets:
+        rows += [_spread(goal, edges, {target.name: w}) for w in _place_rows(target)]
+        rows += [_spread(goal, edges, {target.name: w}) for w in _size_rows(target)]
+    slopes = {} if plan is None else _slopes(targets, plan)
+    rows += [_spread(goal, edges, slopes[m.name]) for m in wanted]
+    C = response.covariance(edges.x.reshape(-1, 3), csr_array(np.stack(rows)))
+    clear = {name: bool(edges.found[goal.rows[name]].mean() >= FEWEST_EDGES) for name in names}
+    u, sizes, k = np.empty(len(targets)), np.full(len(targets), np.nan), 0
+    for i, target in enumerate(targets):
+        n_place, n_size = len(_place_rows(target)), len(_size_rows(target))
+        own = C[k : k + n_place, k : k + n_place]
+        single = target.shape is None and target.kind not in ("plane", "line")
+        square = float(np.trace(own) / n_place if single else np.linalg.eigvalsh(own)[-1])
+        u[i] = np.sqrt(max(square, 0.0)) if clear[target.name] else np.inf
+        if n_size:
+            sizes[i] = np.sqrt(C[k + n_place, k + n_place]) if clear[target.name] else np.inf
+        k += n_place + n_size
+    of = np.sqrt(np.diag(C)[k:])
+    known = [all(clear[f] for f in m.of) for m in wanted]
+    return u, sizes, {m.name: float(x) if c else np.inf for m, x, c in zip(wanted, of, known, strict=True)}
+
+
+def _spread(goal: Goal, edges: ExpectedEdges, weights: Mapping[str, Array]) -> Array:
+    """(samples,) weights of grey levels, from weights (m,) of the edges of some targets."""
+    out = np.zeros(edges.L.shape)
+    for name, w in weights.items():
+        rows = goal.rows[name]
+        out[rows] = w[:, None] * np.where(edges.found[rows, None], edges.L[rows], 0.0)
+        out[rows] *= np.abs(w).sum() / max(float(np.abs(w[edges.found[rows]]).sum()), 1e-300)
+    return out.ravel()
+
+
+def _parameters(target: Target) -> Array:
+    """(p, m): by how much the parameters of `derivatives` move with each point's edge along its normal."""
+    inverse: Array = np.linalg.pinv(target.derivatives())
+    if target.shape is None:
+        return inverse
+    return -inverse * target.outward
+
+
+def _place_rows(target: Target) -> Array:
+    """(k, m): along each direction that the feature's place has; of single points without a shape."""
+    if target.shape is None and target.kind not in ("plane", "line"):
+        rows = np.linspace(0, len(target.x) - 1, min(SINGLE_POINTS, len(target.x))).astype(int)
+        return np.asarray(np.eye(len(target.x))[rows])
+    return _parameters(target)[: 1 if target.shape is None else 3 if target.shape.kind == "sphere" else 2]
+
+
+def _size_rows(target: Target) -> Array:
+    """(1 or 0, m): the radius."""
+    if target.shape is None:
+        return np.zeros((0, len(target.x)))
+    k = {"sphere": 3, "circle": 2, "cylinder": 4, "cone": 4}[target.shape.kind]
+    return _parameters(target)[k : k + 1]
+
+
+def _vector_rows(target: Target) -> tuple[Array, Array]:
+    """(vector (8,), its derivatives (8, m) by each point's edge), as `measurement.features.feature` orders them."""
+    vector, D, p = np.full(8, np.nan), np.zeros((8, len(target.x))), _parameters(target)
+    if target.shape is None:
+        frame, middle = frame_along(target.n[0]), target.x.mean(axis=0)
+        vector[:3], vector[3:6] = middle, frame[2]
+        D[:3] = np.outer(frame[2], p[0])
+        if target.kind == "plane":
+            D[3:6] = -frame[:2].T @ p[1:3]
+        else:
+            vector[3:6], along = target.along, (target.x - middle) @ target.along
+            D[3:6] = np.outer(frame[2], along / (along @ along))
+        return vector, D
+    s = target.shape
+    vector[:3], vector[6] = s.point, s.radius
+    if s.kind == "sphere":
+        D[:3], D[6] = p[:3], p[3]
+        return vector, D
+    vector[3:6], D[:3] = s.frame[2], s.frame[:2].T @ p[:2]
+    D[6] = p[2 if s.kind == "circle" else 4]
+    if s.kind != "circle":
+        D[3:6] = s.frame[:2].T @ p[2:4]
+    if s.kind == "cone":
+        vector[7], D[7] = s.psi, p[5]
+    return vector, D
+
+
+def _lengths(plan: MeasurementPlan | None) -> tuple[MeasurandPlan, ...]:
+    """The measurands that are predicted: distances and diameters of least-squares features."""
+    if plan is None:
+        return ()
+    return tuple(
+        m
+        for m in plan.measurands
+        if m.kind in PREDICTED
+        and m.reference is None
+        and all(f in plan.features and plan.features[f].reference == "least-squares" for f in m.of)
+    )
+
+
+def _slopes(targets: tuple[Target, ...], plan: MeasurementPlan) -> dict[str, dict[str, Array]]:
+    """Length -> target -> (m,) derivative of the length by each point's edge, by central differences."""
+    wanted = _lengths(plan)
+    bare = plan.model_copy(update={"measurands": wanted, "spheres": None})
+    nowhere = Alignment(R=np.eye(3), t=np.zeros(3), rule="given")
+    ways = {t.name: _vector_rows(t) for t in targets}
+    features = {t.name: _feature(t, ways[t.name][0]) for t in targets}
+    out: dict[str, dict[str, Array]] = {m.name: {} for m in wanted}
+    for name in {f for m in wanted for f in m.of}:
+        vector, D = ways[name]
+        for k in np.flatnonzero(D.any(axis=1)):
+            ends = []
+            for side in (1, -1):
+                moved = vector + side * STEP * np.eye(8)[k]
+                ends.append(evaluate(bare, {**features, name: replace(features[name], vector=moved)}, nowhere))
+            for above, below in zip(*ends, strict=True):
+                slope = (above.value - below.value) / (2 * STEP)
+                if slope:
+                    out[above.name][name] = out[above.name].get(name, np.zeros(D.shape[1])) + slope * D[k]
     return out
 
 
-def _of_parameters(target: Target, I: Array) -> tuple[float, float]:
-    """(u of the position, u of the radius), mm."""
-    J = target.derivatives()
-    if target.shape is None and target.kind not in ("plane", "line"):
-        mean = float(I.mean())
-        return (float(1 / np.sqrt(mean)) if mean > 0 else float("inf")), float("nan")
-    N = np.einsum("m,mp,mq->pq", I, J, J)
-    size = np.sqrt(np.maximum(np.diag(N), 1e-300))
-    value, vector = np.linalg.eigh(N / np.outer(size, size))
-    if value[0] <= SINGULAR * max(value[-1], 1e-300):
-        return float("inf"), float("inf") if target.shape is not None else float("nan")
-    C = (vector / value) @ vector.T / np.outer(size, size)
-    if target.shape is None:
-        return float(np.sqrt(C[0, 0])), float("nan")
-    axes = {"sphere": (3, 3), "circle": (2, 2), "cylinder": (2, 4), "cone": (2, 4)}[target.shape.kind]
-    u = float(np.sqrt(np.linalg.eigvalsh(C[: axes[0], : axes[0]])[-1]))
-    return u, float(np.sqrt(C[axes[1], axes[1]]))
+def _feature(target: Target, vector: Array) -> Feature:
+    """The nominal feature as if it had been measured without scatter."""
+    n = len(target.x)
+    return Feature(
+        kind=target.kind,
+        vector=vector,
+        covariance=np.zeros((8, 8)),
+        points=target.x,
+        used=np.ones(n, dtype=bool),
+        residuals=np.zeros(n),
+        n_effective=float(n),
+        dof=float(n),
+    )
 
 
 def shared_part(goal: Goal, scanner: Scanner, P: Array, sigma_px: Array) -> Array:
     """(targets,) mm: the calibration's shared standard uncertainty in px at points, (targets,), at the object."""
     depth = np.array([np.mean(P[:, 2, :3] @ t.x.mean(axis=0) + P[:, 2, 3]) for t in goal.targets])
     return np.asarray(sigma_px * scanner.p_u * depth / scanner.d_SD)
-
-
-def measurand_u(measurands: Sequence[MeasurandPlan], found: Sequence[Predicted]) -> dict[str, float]:
-    """Standard uncertainty, mm, of the diameters and distances of a plan; other kinds are not predicted."""
-    by = {p.name: p for p in found}
-    out = {}
-    for m in measurands:
-        if m.kind == "diameter" and m.of[0] in by:
-            out[m.name] = 2 * by[m.of[0]].u_size
-        elif m.kind == "distance" and all(f in by for f in m.of):
-            out[m.name] = float(np.hypot(by[m.of[0]].u, by[m.of[1]].u))
-    return out
 
 
 def why_unseen(goal: Goal, P: Array, views: Views, target: Target) -> str:

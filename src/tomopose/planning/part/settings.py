@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 from tomopose.errors import InputError
+from tomopose.reconstruction.settings import require_count
 from tomopose.values import value
 
 WEIGHTS = (0.5, 0.3, 0.2)
@@ -35,7 +36,7 @@ PLANES, TUY_POINTS = 250, 24
 class PartSettings:
     """What J means and how it is searched.
 
-    mu:                 linear attenuation coefficient of the part, 1/mm.
+    mu:                 linear attenuation coefficient of the part as a volume shows it, 1/mm.
     least_transmission: below it a ray holds no information on a surface.
     least_view_transmission:  mean over the points that a view has to have to be a candidate; 0 admits all.
     tangent:            rad; a ray within this angle of the surface's tangent plane shows where the surface is.
@@ -44,6 +45,8 @@ class PartSettings:
     alpha_step, tilt_step:  rad, of the grid of candidates.
     quanta, readout:    detected quanta of an open pixel and readout noise in quanta, of the predicted uncertainty.
     blur:               standard width of the unsharpness at the panel, px.
+    sweeps, room:       of SART, and by how many mm the reconstructed box is larger than the part on each side; of the
+                        predicted uncertainty too.
     seed:               of the random points where the whole surface is the feature.
     """
 
@@ -58,6 +61,8 @@ class PartSettings:
     quanta: float = 20_000.0
     readout: float = 0.0
     blur: float = 0.5
+    sweeps: int = 1
+    room: float = 5.0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -71,6 +76,7 @@ class PartSettings:
             raise InputError(
                 f"least_view_transmission is {self.least_view_transmission}; a share from 0 to below 1 is needed"
             )
-        for name in ("margin", "readout", "blur"):
+        require_count("sweeps", self.sweeps)
+        for name in ("margin", "readout", "blur", "room"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise InputError(f"{name} is {getattr(self, name)}; a number from 0 is needed")

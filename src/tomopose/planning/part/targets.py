@@ -40,6 +40,22 @@ class Target:
     radius: float = np.inf
     length: float = np.inf
 
+    @property
+    def outward(self) -> Array:
+        """(m,) 1 where the material lies inside the shape, -1 where it lies outside, as at a bore."""
+        assert self.shape is not None
+        y = self.x - self.shape.point
+        if self.shape.kind != "sphere":
+            y = y - np.outer(y @ self.shape.frame[2], self.shape.frame[2])
+        return np.sign(np.einsum("mc,mc->m", y, self.n))
+
+    @property
+    def along(self) -> Array:
+        """(3,) unit vector from the first point to the last: the direction of a line."""
+        d = self.x[-1] - self.x[0]
+        along: Array = d / np.linalg.norm(d)
+        return along
+
     def derivatives(self) -> Array:
         """(m, p): of the distance along the normal by the feature's parameters; a plane's are offset and two tilts."""
         if self.shape is not None:
@@ -61,13 +77,21 @@ def targets_of(part: Part, plan: MeasurementPlan | None, *, judged: bool = False
         x, n = surface_points(part.mesh, SURFACE_POINTS, seed + 1000 * judged + 1)
         area = np.linalg.norm(part.mesh.face_normals, axis=1).sum() / 2
         return (Target(name="surface", kind="surface", x=x, n=n, area=float(area) / len(x), length=part.mesh.size),)
-    rows = np.array(plan.alignment.start, dtype=np.float64)
-    alignment = Alignment(R=rows[:, :3], t=rows[:, 3], rule="given")
     each = int(np.clip(MOST_POINTS // len(plan.features), FEWEST_POINTS, POINTS))
     each = each * POINTS_JUDGED // POINTS if judged else each
-    found = tuple(_target(name, p, alignment, each) for name, p in plan.features.items())
+    found = tuple(_target(name, p, _start(plan), each) for name, p in plan.features.items())
     _require_on_part(part, found)
     return found
+
+
+def probed_targets(plan: MeasurementPlan, most: int) -> tuple[Target, ...]:
+    """The features of a plan with the points that they are measured at, at most `most` of each."""
+    return tuple(_target(name, p, _start(plan), min(p.n_points, most)) for name, p in plan.features.items())
+
+
+def _start(plan: MeasurementPlan) -> Alignment:
+    rows = np.array(plan.alignment.start, dtype=np.float64)
+    return Alignment(R=rows[:, :3], t=rows[:, 3], rule="given")
 
 
 def _target(name: str, p: FeaturePlan, alignment: Alignment, each: int) -> Target:

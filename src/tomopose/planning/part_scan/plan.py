@@ -11,7 +11,7 @@ from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.errors import InputError
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.planning.part.predict import Predicted, measurand_u, predicted, shared_part, why_unseen
+from tomopose.planning.part.predict import Predicted, predicted, shared_part, why_unseen
 from tomopose.planning.part.settings import WEIGHTS, PartSettings
 from tomopose.planning.part.worth import Goal, Views, Worth, table, worth
 from tomopose.planning.part_scan.choose import choose, dual_bound, value
@@ -216,12 +216,12 @@ class _Judge:
             sigma = projection_matrices(self.setting.calibration, self.machine.poses(q), points=x).points_sigma_shared
             assert sigma is not None
             shared = shared_part(goal, self.machine.scanner, P, np.asarray(sigma).reshape(-1, len(x)).mean(axis=0))
-        found = tuple(predicted(goal, self.machine.scanner, P, views, shared=shared))
+        found, lengths = predicted(goal, self.machine.scanner, P, views, plan=self.setting.features, shared=shared)
         return Judged(
             q=q,
             worth=worth(goal, P, views),
-            features=found,
-            lengths={} if self.setting.features is None else measurand_u(self.setting.features.measurands, found),
+            features=tuple(found),
+            lengths=lengths,
             travel=travel(self.machine, q),
             duration=time_of(self.machine, self.setting.limits.time, q),
             tau=views.M,

@@ -60,6 +60,8 @@ def _constants(s: PartSettings) -> Content:
         "quanta": s.quanta,
         "readout_quanta": s.readout,
         "blur_px": s.blur,
+        "sweeps": s.sweeps,
+        "room_mm": s.room,
         "seed": s.seed,
     }
 

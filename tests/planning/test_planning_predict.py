@@ -1,0 +1,136 @@
+"""The predicted uncertainty: against SART itself with noise, and against what is known of fits."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+import tomopose as tp
+from tomopose.geometry.projection import ProjectionMatrices
+from tomopose.measurement.mesh.mesh import Mesh
+from tomopose.measurement.plan import plan_from
+from tomopose.planning.part.part import Part
+from tomopose.planning.part.predict import _slopes, predicted
+from tomopose.planning.part.sart_response import sart_response
+from tomopose.planning.part.settings import PartSettings
+from tomopose.planning.part.targets import probed_targets
+from tomopose.planning.part.worth import table
+from tomopose.planning.part_scan.setting import Setting
+from tomopose.reconstruction.settings import SART
+
+HALF = np.array([9.0, 7.0, 4.0])
+VIEWS, SWEEPS = 15, 2
+QUADS = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+
+
+def box_part() -> Part:
+    corners = np.array(list(itertools.product((-1, 1), (-1, 1), (-1, 1)))) * HALF
+    faces = np.array([t for a, b, c, d in QUADS for t in ((a, b, c), (a, c, d))])
+    mesh = Mesh(points=corners, faces=faces)
+    outward = np.einsum("ij,ij->i", corners[faces].mean(axis=1), mesh.face_normals) > 0
+    return Part(mesh=Mesh(points=corners, faces=np.where(outward[:, None], faces, faces[:, ::-1])))
+
+
+def task(**changed: object) -> Setting:
+    scanner = tp.Scanner(d_SD=1000.0, d_SR=400.0, p_u=1.6, p_v=1.5, u_0=23.3, v_0=20.1, n_u=47, n_v=43)
+    settings = PartSettings(mu=0.05, sweeps=SWEEPS, room=4.0, quanta=2.0e4)
+    return Setting(**{"scanner": scanner, "part": box_part(), "views": VIEWS, "settings": settings, **changed})
+
+
+def tilted_turn(setting: Setting) -> np.ndarray:
+    q = np.zeros((VIEWS, 7))
+    q[:, 6] = np.arange(VIEWS) * 2 * np.pi / VIEWS
+    q[:, 3], q[:, 4] = np.radians(10 * np.sin(3 * q[:, 6])), np.radians(10 * np.cos(3 * q[:, 6]))
+    return setting.machine.matrices(q)
+
+
+def test_the_noise_of_sums_over_a_volume_is_that_of_sart(rng):
+    """White noise of the line integrals through `reconstruct`; sums over a voxel, a face's patch and a column."""
+    setting = task()
+    P, s = tilted_turn(setting), setting.scanner
+    spacing = s.p_u * s.d_SR / s.d_SD
+    n = np.ceil((2 * HALF + 2 * setting.settings.room) / spacing).astype(int)
+    grid = tp.VoxelGrid((int(n[2]), int(n[1]), int(n[0])), spacing, np.zeros(3))
+    names = tuple(str(j) for j in range(VIEWS))
+    matrices = ProjectionMatrices(P=P, n_u=s.n_u, n_v=s.n_v, p_u=s.p_u, p_v=s.p_v, pose_id=names, scanner=s)
+    sigma = 0.01
+    steps = np.arange(-3, 4) * spacing
+    u, v = (w.ravel() for w in np.meshgrid(steps, steps))
+    zero = np.zeros_like(u)
+    sums = [np.column_stack([u, v, zero + HALF[2]]), np.column_stack([zero + HALF[0], u, v])]
+    sums.append(np.column_stack([0 * steps, 0 * steps, steps]))
+    values = []
+    for _ in range(40):
+        images = rng.normal(0, sigma, (VIEWS, s.n_v, s.n_u)).astype(np.float32)
+        volume = tp.reconstruct(
+            images,
+            matrices,
+            grid,
+            images_are="line-integrals",
+            algorithm=SART(iterations=SWEEPS),
+            engine="cpu",
+            consistency="off",
+        )
+        nearest = [np.rint(grid.indices(x)).astype(int) for x in sums]
+        values.append([volume.values[i[:, 0], i[:, 1], i[:, 2]].mean() for i in nearest])
+    achieved = np.std(values, axis=0, ddof=1)
+    response = sart_response(setting.part, s, P, setting.settings)
+    response = replace(response, variance=np.full_like(response.variance, sigma**2))
+    first = np.cumsum([0, *(len(x) for x in sums)])
+    weights = np.zeros((3, first[-1]))
+    for k, x in enumerate(sums):
+        weights[k, first[k] : first[k + 1]] = 1 / len(x)
+    expected = np.sqrt(np.diag(response.covariance(np.concatenate(sums), csr_array(weights))))
+    # a standard deviation of 40 draws is uncertain by 11 %; the filters take planes of Fourier space as separate
+    np.testing.assert_allclose(expected / achieved, 1.0, atol=0.35)
+
+
+FEATURES = {
+    "top": {"kind": "plane", "point": [-5, 0, 4], "direction": [0, 0, 1], "u": [2, 0, 0], "v": [0, 5, 0]},
+    "bottom": {"kind": "plane", "point": [5, 0, -4], "direction": [0, 0, -1], "u": [2, 0, 0], "v": [0, 5, 0]},
+    "ball": {"kind": "sphere", "point": [0, 0, 0], "radius_mm": 3.0},
+}
+
+
+def plan() -> tp.MeasurementPlan:
+    rows = [
+        {"name": "height", "kind": "distance", "of": ["top", "bottom"]},
+        {"name": "D", "kind": "diameter", "of": ["ball"]},
+    ]
+    document = {"schema": "tomopose/measurement-plan/1", "unit": "mm", "features": FEATURES, "measurands": rows}
+    return plan_from(document)
+
+
+def test_a_length_follows_the_edges_through_fit_and_lever():
+    """Moving one end of the first plane tilts its normal, and the second plane's middle lies 10 mm beside it."""
+    targets = probed_targets(plan(), 200)
+    slopes = _slopes(targets, plan())
+    top, bottom, ball = targets
+    tilt = 1e-3 * (top.x[:, 0] + 5)
+    assert slopes["height"]["top"] @ tilt == pytest.approx(1e-3 * 10, rel=1e-6)
+    assert slopes["height"]["top"] @ np.full(len(top.x), 1e-3) == pytest.approx(1e-3, rel=1e-6)
+    assert slopes["height"]["bottom"] @ np.full(len(bottom.x), 1e-3) == pytest.approx(1e-3, rel=1e-6)
+    assert slopes["D"]["ball"] @ np.full(len(ball.x), 1e-3) == pytest.approx(2e-3, rel=1e-6)
+
+
+def test_four_times_the_quanta_halve_the_uncertainty():
+    features = plan().model_copy(update={"features": {k: v for k, v in plan().features.items() if k != "ball"}})
+    features = features.model_copy(update={"measurands": features.measurands[:1]})
+    setting = task(features=features)
+    P = tilted_turn(setting)
+    u = []
+    for quanta in (2e4, 8e4):
+        goal = replace(setting.goal(), settings=replace(setting.settings, quanta=quanta))
+        targets, lengths = predicted(goal, setting.scanner, P, table(goal, P), plan=features)
+        u.append([*(t.u for t in targets), lengths["height"]])
+    assert all(math.isfinite(x) for x in u[0])
+    np.testing.assert_allclose(np.array(u[0]) / u[1], 2.0, rtol=1e-6)
+    # the calibration's share comes in quadrature
+    shared = np.array([0.03, 0.04])
+    with_own = predicted(goal, setting.scanner, P, table(goal, P), plan=features, shared=shared)[1]["height"]
+    assert with_own == pytest.approx(math.hypot(u[1][-1], 0.05), rel=1e-9)
