@@ -17,6 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 from parts import CASES, Case
+from scans import PATHS, compare_all
 
 import tomopose as tp
 from tomopose.planning.part.settings import PartSettings
@@ -119,12 +120,13 @@ def main() -> None:
         "--images", nargs="*", choices=list(CASES), help="virtual scans only: of all parts, or of these"
     )
     parser.add_argument("--draws", type=int, default=16, help="virtual scans of each path")
+    parser.add_argument("--paths", nargs="+", choices=PATHS, default=PATHS, help="of the virtual scans")
     given = parser.parse_args()
     if given.images is not None:
-        from scans import compare_all
-
         cases = {name: CASES[name]() for name in given.images or CASES}
-        compare_all({name: (case, setting(case, given.views)) for name, case in cases.items()}, given.draws)
+        compare_all(
+            {name: (case, setting(case, given.views)) for name, case in cases.items()}, given.draws, given.paths
+        )
     else:
         worth_table(given.views)
         large()

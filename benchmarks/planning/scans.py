@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,6 +41,8 @@ SWEEPS, SCATTER = 4, Scatter(amount=0.2, sigma=20.0)
 HALF_DRAWS = 2
 """Of the plan with half as many views, whose error is looked at and not its scatter."""
 HOLDS = (0.8, 1.25)
+PATHS = ("plan", "half", "circular")
+"""half: planned with half as many views."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,25 +136,22 @@ def scanned(case: Case, task: Setting, q: Array, draws: int) -> Lengths:
     return Lengths(errors=errors, u=u)
 
 
-def compare(name: str, case: Case, task: Setting, draws: int) -> list[float]:
-    """Prints errors and scatter of every length; returns predicted over achieved scatter of all of them."""
+def compare(name: str, case: Case, task: Setting, draws: int, wanted: Sequence[str]) -> list[float]:
+    """Prints errors and scatter of every length along the wanted paths; returns predicted over achieved scatter."""
     task = replace(task, scanner=task.scanner.binned(BINNING), features=case.lengths)
     coarse = replace(task.settings, alpha_step=math.radians(6.0), tilt_step=math.radians(5.0))
     task = replace(task, settings=coarse)
-    N, ratios, rms = task.views, [], {}
-    paths = {
-        "plan": (plan_part_scan(task).chosen.q, draws),
-        "half": (plan_part_scan(replace(task, views=N // 2)).chosen.q, HALF_DRAWS),
-        "circular": (usual_paths(task.machine, N)["circular"], draws),
-    }
-    for path, (q, count) in paths.items():
-        start = time.process_time()
+    ratios: list[float] = []
+    for path in wanted:
+        start, N = time.process_time(), task.views // 2 if path == "half" else task.views
+        circular = path == "circular"
+        q = usual_paths(task.machine, N)[path] if circular else plan_part_scan(replace(task, views=N)).chosen.q
+        count = HALF_DRAWS if path == "half" else draws
         try:
             found = scanned(case, task, q, count)
         except InputError as error:
             print(f"{name:<9} {path:<9}{len(q):>3}  not measurable: {error}", flush=True)
             continue
-        rms[path] = found.rms
         for length, values in found.errors.items():
             u, sd = found.u[length], found.scatter(length)
             text = "" if count == HALF_DRAWS else f"{1000 * sd:8.2f}{1000 * u:8.2f}{u / sd:7.2f}"
@@ -166,10 +166,10 @@ def compare(name: str, case: Case, task: Setting, draws: int) -> list[float]:
     return ratios
 
 
-def compare_all(cases: dict[str, tuple[Case, Setting]], draws: int) -> None:
+def compare_all(cases: dict[str, tuple[Case, Setting]], draws: int, wanted: Sequence[str]) -> None:
     """All parts: mean error, scatter, predicted scatter in um and their ratio; then how many hold."""
     print(f"{draws} draws, {SWEEPS} sweeps of SART; mean error; scatter; predicted scatter, um; ratio")
-    ratios = np.array([r for name, (case, task) in cases.items() for r in compare(name, case, task, draws)])
+    ratios = np.array([r for name, (case, task) in cases.items() for r in compare(name, case, task, draws, wanted)])
     held = (ratios >= HOLDS[0]) & (ratios <= HOLDS[1])
     print(
         f"predicted / achieved: {held.sum()} of {len(ratios)} within {HOLDS[0]} to {HOLDS[1]}; median "

@@ -29,7 +29,7 @@ from tomopose.values import require_types, value
 class ScanPlan:
     """Views of a part in the order to be taken.
 
-    poses:    of the views;  matrices: theirs, part at home to pixels;  way: poses between the views of a continuous scan.
+    poses:    of the views;  matrices: theirs, part at home to pixels;  way: poses between the views, if continuous.
     J, bound: what the views are worth on the points that they were chosen with, and what no choice of as many of the
               candidates could exceed.
     u_mm:     standard uncertainty of each distance and diameter of the measurement plan that noise lets expect, mm; inf
