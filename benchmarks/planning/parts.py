@@ -20,12 +20,14 @@ SEGMENTS, N_POINTS = 96, 300
 class Case:
     """A part with its plan, attenuation (1/mm), scanner's magnification and largest tilt (deg).
 
-    plan: what views are chosen and judged by; None for the whole surface;  lengths: what is measured in virtual scans.
+    plan: what views are chosen and judged by; None for the whole surface;  lengths: what is measured in virtual
+    scans, whose panel is read out in blocks of `binning`.
     """
 
     part: Part
     plan: tp.MeasurementPlan | None
     lengths: tp.MeasurementPlan
+    binning: int = 2
     mu: float
     d_SR: float
     tilt: float
@@ -119,7 +121,7 @@ def tall_box() -> Case:
     }
     distances = [("floor", "sole"), ("left", "right"), ("inner", "right")]
     plan = _plan(features, distances)
-    return Case(part=_part("tall box", solid), plan=plan, lengths=plan, mu=0.08, d_SR=420.0, tilt=15.0)
+    return Case(part=_part("tall box", solid), plan=plan, lengths=plan, binning=1, mu=0.08, d_SR=420.0, tilt=15.0)
 
 
 def blade() -> Case:

@@ -246,7 +246,7 @@ def shared_part(goal: Goal, scanner: Scanner, P: Array, sigma_px: Array) -> Arra
     return np.asarray(sigma_px * scanner.p_u * depth / scanner.d_SD)
 
 
-def why_unseen(goal: Goal, P: Array, views: Views, target: Target) -> str:
+def why_unseen(goal: Goal, views: Views, target: Target) -> str:
     """In words, why no candidate sees some of a target's points, and which further tilt would."""
     rows, s = goal.rows[target.name], goal.settings
     hidden = np.flatnonzero(views.A[:, rows].max(axis=0) == 0)
@@ -261,7 +261,7 @@ def why_unseen(goal: Goal, P: Array, views: Views, target: Target) -> str:
             f"{s.least_transmission:g} is needed): a higher voltage, or another placing of the part"
         )
     k = int(hidden[int(least.argmax())])
-    d = target.x[k] - source_path(P)[int(views.incidence[:, rows][:, k].argmin())]
+    d = target.x[k] - source_path(views.P)[int(views.incidence[:, rows][:, k].argmin())]
     d /= np.linalg.norm(d)
     turn = np.cross(d, target.n[k])
     turn /= max(float(np.linalg.norm(turn)), 1e-12)

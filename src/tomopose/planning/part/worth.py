@@ -65,10 +65,12 @@ class Goal:
 class Views:
     """Tables of n views for one goal.
 
+    P (n, 3, 4): their matrices, part at home to pixels.
     A (n, E) float32: what each view gives to each element, 0 to 1;  tau (n, m + k) float32: transmission at the points
     of the targets and of Tuy's condition;  incidence (n, m) float32: |n . d| of the points of the targets.
     """
 
+    P: Array
     A: np.ndarray
     tau: np.ndarray
     incidence: np.ndarray
@@ -79,7 +81,7 @@ class Views:
         return np.asarray(self.tau.mean(axis=1), dtype=np.float64)
 
     def take(self, rows: np.ndarray) -> Views:
-        return Views(A=self.A[rows], tau=self.tau[rows], incidence=self.incidence[rows])
+        return Views(P=self.P[rows], A=self.A[rows], tau=self.tau[rows], incidence=self.incidence[rows])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +114,7 @@ def table(goal: Goal, P: Array) -> Views:
     A = np.empty((len(P), len(x) + k * len(goal.planes)), dtype=np.float32)
     A[:, : len(x)] = (incidence <= np.sin(settings.tangent)) & (tau[:, : len(x)] >= settings.least_transmission)
     A[:, len(x) :] = _tuy(goal, s, tau[:, len(x) :]).reshape(len(P), -1)
-    return Views(A=A, tau=tau, incidence=incidence.astype(np.float32))
+    return Views(P=P, A=A, tau=tau, incidence=incidence.astype(np.float32))
 
 
 def _beta(goal: Goal, s: Array) -> Array:

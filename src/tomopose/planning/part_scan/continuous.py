@@ -58,11 +58,11 @@ def of_one_turn(setting: Setting) -> Setting:
     return replace(setting, settings=replace(setting.settings, alpha_step=max(float(width) / slots, 1e-9)))
 
 
-def smooth_turn(setting: Setting, q: Array, P: Array, tables: Views, m: Array, w: Array) -> np.ndarray:
+def smooth_turn(setting: Setting, q: Array, tables: Views, m: Array, w: Array) -> np.ndarray:
     """Rows (N,) of the candidates q (n, 7) of `of_one_turn`, in the order of the turn.  OutOfReachError where a table
     angle has no candidate, or no smooth way leads through all.
 
-    P (n, 3, 4), tables:  of the candidates;  m (n,), w (E,): as in `choose`.
+    tables:  of the candidates;  m (n,), w (E,): as in `choose`.
     """
     angles, slot = np.unique(np.round(q[:, 6], 9), return_inverse=True)
     if len(angles) < setting.views:
@@ -71,7 +71,7 @@ def smooth_turn(setting: Setting, q: Array, P: Array, tables: Views, m: Array, w
             "allowed; widen the limits, or plan without --continuous",
             limits=setting.limits,
         )
-    ray = source_path(P) - setting.part.centre
+    ray = source_path(tables.P) - setting.part.centre
     turn = _Turn(
         slots=[np.flatnonzero(slot == k) for k in range(len(angles))],
         height=np.arcsin(ray[:, 2] / np.linalg.norm(ray, axis=1)),

@@ -13,7 +13,7 @@ from tomopose.planning.part_scan.choose import without_each
 from tomopose.planning.part_scan.stations import Machine, allowed
 from tomopose.units import Array
 
-ROUNDS = 2
+ROUNDS = 3
 """Each halves the steps of the one before."""
 LIFT_STEP_MM = 2.0
 
@@ -21,7 +21,7 @@ LIFT_STEP_MM = 2.0
 def refine_off_grid(goal: Goal, machine: Machine, q: Array, views: Views) -> tuple[Array, Views]:
     """(q (n, 7), their tables): no view worth less for J than before, all within limits, in view and clear."""
     q, w, n = q.copy(), goal.w, len(q)
-    A, tau, incidence = (np.array(a) for a in (views.A, views.tau, views.incidence))
+    P, A, tau, incidence = (np.array(a) for a in (views.P, views.A, views.tau, views.incidence))
     s = goal.settings
     full = np.array([s.alpha_step, s.tilt_step, s.tilt_step, LIFT_STEP_MM])
     best, second, who = without_each(A, np.arange(n))
@@ -41,9 +41,10 @@ def refine_off_grid(goal: Goal, machine: Machine, q: Array, views: Views) -> tup
             own = float(np.maximum(A[i] - base, 0) @ w) + WEIGHTS[2] * float(tau[i].mean()) / n
             k = int(np.argmax(gains))
             if gains[k] > own + 1e-9:
-                q[i], A[i], tau[i], incidence[i] = around[k], tried.A[k], tried.tau[k], tried.incidence[k]
+                q[i], P[i], A[i] = around[k], tried.P[k], tried.A[k]
+                tau[i], incidence[i] = tried.tau[k], tried.incidence[k]
                 best, second, who = without_each(A, np.arange(n))
-    return q, Views(A=A, tau=tau, incidence=incidence)
+    return q, Views(P=P, A=A, tau=tau, incidence=incidence)
 
 
 def _neighbours(machine: Machine, q: Array, step: Array) -> Array:

@@ -122,7 +122,7 @@ def plan_part_scan(setting: Setting, *, progress: Progress = _silent) -> PartSca
     progress(f"choosing {views} of {len(q_all)}")
     m = WEIGHTS[2] * tables.M / views
     if setting.continuous:
-        rows = smooth_turn(setting, q_all, machine.matrices(q_all), tables, m, goal.w)
+        rows = smooth_turn(setting, q_all, tables, m, goal.w)
         q, fine = q_all[rows], tables.take(rows)
     else:
         rows = choose(tables.A, m, goal.w, views)
@@ -145,7 +145,7 @@ def plan_part_scan(setting: Setting, *, progress: Progress = _silent) -> PartSca
         candidates=len(q_all),
         chosen=judge(q),
         paths={name: judge(path) for name, path in usual_paths(machine, len(q)).items()},
-        unseen=_unseen(goal, machine, q_all, tables),
+        unseen=_unseen(goal, tables),
         goal=judge.goal,
         settings=setting.settings,
         machine=machine,
@@ -188,14 +188,13 @@ def _within_time(
     return q[:kept][order], (len(q) - kept, lost)
 
 
-def _unseen(goal: Goal, machine: Machine, q: Array, tables: Views) -> dict[str, str]:
-    P = machine.matrices(q)
+def _unseen(goal: Goal, tables: Views) -> dict[str, str]:
     out = {}
     for target in goal.targets:
         never = float((tables.A[:, goal.rows[target.name]].max(axis=0) == 0).mean())
         if never > 0:
             out[target.name] = f"{100 * never:.0f} % of it is seen by no allowed view: " + why_unseen(
-                goal, P, tables, target
+                goal, tables, target
             )
     return out
 
