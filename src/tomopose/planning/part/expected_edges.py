@@ -65,7 +65,7 @@ def _fitted(profiles: Array, sigma: float) -> tuple[Array, np.ndarray]:
 
 
 def _blur(response: SartResponse, x: Array, n: Array) -> float:
-    """Common standard width of the edges, voxels, as the measurement estimates it."""
+    """Common standard width of a feature's edges, voxels, as the measurement estimates it."""
     rows = np.linspace(0, len(x) - 1, min(len(x), SIGMA_POINTS)).astype(int)
     sigma = START_SIGMA
     for _ in range(SIGMA_ROUNDS):
@@ -83,7 +83,7 @@ def _blur(response: SartResponse, x: Array, n: Array) -> float:
 
 
 def expected_edges(response: SartResponse, x: Array, n: Array) -> ExpectedEdges:
-    """Of points x (m, 3), mm, with unit normals n (m, 3) from material to air."""
+    """Of the points x (m, 3), mm, of one feature with unit normals n (m, 3) from material to air."""
     sigma = _blur(response, x, n)
     s, samples, profiles = _profiles(response, x, n, sigma)
     out, found = _fitted(profiles, sigma)

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, hstack, vstack
 
 from tomopose.geometry.scanner import Scanner
 from tomopose.measurement.alignment import Alignment
@@ -105,15 +105,15 @@ def _from_noise(
         nothing = np.full(len(targets), np.inf)
         return nothing, nothing, {m.name: np.inf for m in wanted}
     response = sart_response(goal.part, scanner, P, goal.settings)
-    edges = expected_edges(response, goal.x, goal.n)
-    names, rows = list(goal.rows), []
+    edges = {t.name: expected_edges(response, t.x, t.n) for t in targets}
+    rows: list[csr_array] = []
     for target in targets:
-        rows += [_spread(goal, edges, {target.name: w}) for w in _place_rows(target)]
-        rows += [_spread(goal, edges, {target.name: w}) for w in _size_rows(target)]
+        rows += [_spread(edges, {target.name: w}) for w in (*_place_rows(target), *_size_rows(target))]
     slopes = {} if plan is None else _slopes(targets, plan)
-    rows += [_spread(goal, edges, slopes[m.name]) for m in wanted]
-    C = response.covariance(edges.x.reshape(-1, 3), csr_array(np.stack(rows)))
-    clear = {name: bool(edges.found[goal.rows[name]].mean() >= FEWEST_EDGES) for name in names}
+    rows += [_spread(edges, slopes[m.name]) for m in wanted]
+    x = np.concatenate([e.x.reshape(-1, 3) for e in edges.values()])
+    C = response.covariance(x, csr_array(vstack(rows)))
+    clear = {name: bool(e.found.mean() >= FEWEST_EDGES) for name, e in edges.items()}
     u, sizes, k = np.empty(len(targets)), np.full(len(targets), np.nan), 0
     for i, target in enumerate(targets):
         n_place, n_size = len(_place_rows(target)), len(_size_rows(target))
@@ -129,14 +129,17 @@ def _from_noise(
     return u, sizes, {m.name: float(x) if c else np.inf for m, x, c in zip(wanted, of, known, strict=True)}
 
 
-def _spread(goal: Goal, edges: ExpectedEdges, weights: Mapping[str, Array]) -> Array:
-    """(samples,) weights of grey levels, from weights (m,) of the edges of some targets."""
-    out = np.zeros(edges.L.shape)
-    for name, w in weights.items():
-        rows = goal.rows[name]
-        out[rows] = w[:, None] * np.where(edges.found[rows, None], edges.L[rows], 0.0)
-        out[rows] *= np.abs(w).sum() / max(float(np.abs(w[edges.found[rows]]).sum()), 1e-300)
-    return out.ravel()
+def _spread(edges: Mapping[str, ExpectedEdges], weights: Mapping[str, Array]) -> csr_array:
+    """(1, samples) weights of grey levels, from weights (m,) of the edges of some targets."""
+    out = []
+    for name, e in edges.items():
+        if name not in weights:
+            out.append(csr_array((1, e.L.size)))
+            continue
+        w = np.where(e.found, weights[name], 0.0)
+        w *= np.abs(weights[name]).sum() / max(float(np.abs(w).sum()), 1e-300)
+        out.append(csr_array((w[:, None] * np.where(e.found[:, None], e.L, 0.0)).reshape(1, -1)))
+    return csr_array(hstack(out))
 
 
 def _parameters(target: Target) -> Array:
