@@ -42,7 +42,7 @@ from tomopose.reconstruction.settings import SART
 from tomopose.trajectory.completeness import source_path
 from tomopose.units import Array
 
-MOST_PIXELS = 128
+MOST_PIXELS = 192
 """Of the part's image along a side; a finer panel is taken in blocks."""
 MARGIN = 12
 """Pixels about the part's image that are filtered with it."""
