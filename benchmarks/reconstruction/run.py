@@ -29,7 +29,7 @@ from reconstruction_phantom import balls, compare, images_of, line_integrals, sc
 from tomopose.engines import make_engine  # noqa: E402
 from tomopose.engines.rtk import RtkEngine, load_itk, rtk_geometry  # noqa: E402
 from tomopose.reconstruction import FDK, PAPER, SART, Execution, reconstruct  # noqa: E402
-from tomopose.reconstruction.order import view_order  # noqa: E402
+from tomopose.trajectory.view_order import view_order  # noqa: E402
 from tomopose.volume import VoxelGrid  # noqa: E402
 
 Result = dict[str, Any]

@@ -16,7 +16,7 @@ from tomopose.measurement.mesh.mesh import Mesh
 from tomopose.measurement.plan import plan_from
 from tomopose.planning.part.part import Part
 from tomopose.planning.part.predict import _slopes, predicted
-from tomopose.planning.part.sart_response import sart_response
+from tomopose.planning.part.sart_response import RELAXATION, sart_response
 from tomopose.planning.part.settings import PartSettings
 from tomopose.planning.part.targets import probed_targets
 from tomopose.planning.part.worth import table
@@ -104,6 +104,10 @@ def plan() -> tp.MeasurementPlan:
     ]
     document = {"schema": "tomopose/measurement-plan/1", "unit": "mm", "features": FEATURES, "measurands": rows}
     return plan_from(document)
+
+
+def test_the_prediction_and_the_reconstruction_relax_alike():
+    assert SART().factors == (RELAXATION,)
 
 
 def test_a_length_follows_the_edges_through_fit_and_lever():

@@ -24,8 +24,8 @@ from tomopose.reconstruction import (
     source_path,
 )
 from tomopose.reconstruction.fdk.filter import DIRECTIONS, FdkFilter, crossings
-from tomopose.reconstruction.order import subsets, view_order
 from tomopose.reconstruction.settings import algorithm_of, name_of, with_options
+from tomopose.trajectory.view_order import subsets, view_order
 from tomopose.volume import VoxelGrid
 
 GRID = VoxelGrid(shape=(62, 64, 64), spacing=np.array([0.1, 0.1, 0.1]), centre=np.array([0.05, -0.1, 0.15]))

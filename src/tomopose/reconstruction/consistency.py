@@ -16,7 +16,7 @@ from tomopose.engines import make_engine
 from tomopose.engines.protocol import Engine
 from tomopose.errors import EngineFailedError, InputError
 from tomopose.reconstruction.line_integrals import LineIntegrals
-from tomopose.reconstruction.order import view_order
+from tomopose.trajectory.view_order import view_order
 from tomopose.volume import VoxelGrid
 
 VIEWS, PIXELS, VOXELS, SWEEPS = 60, 96, 56, 2

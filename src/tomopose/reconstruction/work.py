@@ -21,9 +21,9 @@ from tomopose.reconstruction.field import DaskField, DiskField, Field, Piece
 from tomopose.reconstruction.findings import Agreement, agreement_of
 from tomopose.reconstruction.line_integrals import LineIntegrals
 from tomopose.reconstruction.memory import memory_plan, require_room_for_cgls, sampling_stride
-from tomopose.reconstruction.order import subsets, view_order
 from tomopose.reconstruction.settings import CGLS, FDK, SART, Execution, described
 from tomopose.reconstruction.updates import Samples, Subset, Update, cgls, fdk_update, run, sart_update
+from tomopose.trajectory.view_order import subsets, view_order
 from tomopose.volume import VoxelGrid
 
 FDK_SUBSET = 4

@@ -37,11 +37,12 @@ from tomopose.geometry.scanner import Scanner
 from tomopose.planning.part.material_paths import material_paths
 from tomopose.planning.part.part import Part
 from tomopose.planning.part.settings import PartSettings
-from tomopose.reconstruction.order import view_order
-from tomopose.reconstruction.settings import SART
 from tomopose.trajectory.completeness import source_path
+from tomopose.trajectory.view_order import view_order
 from tomopose.units import Array
 
+RELAXATION = 0.8
+"""Of `reconstruct` with sart unless another is asked for."""
 MOST_PIXELS = 192
 """Of the part's image along a side; a finer panel is taken in blocks."""
 MARGIN = 12
@@ -141,7 +142,7 @@ def _filters(part: Part, P: Array, settings: PartSettings, padded: tuple[int, in
     per_mm = [(P[:, k, :3] - x_D[:, k, None] * P[:, 2, :3]) / depth for k in (0, 1)]
     f = np.stack(np.meshgrid(fft.rfftfreq(padded[1]), fft.fftfreq(padded[0])), axis=-1)
     signal, noise = np.empty((2, n, *f.shape[:2]))
-    how = float(SART().factors[0]), settings.sweeps
+    how = RELAXATION, settings.sweeps
     _fill(f, np.stack(per_mm, axis=1), d, _chords(part, s, settings.room), place, how, signal, noise)
     return signal, noise
 

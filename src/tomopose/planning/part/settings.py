@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 
 from tomopose.errors import InputError
-from tomopose.reconstruction.settings import require_count
 from tomopose.values import value
 
 WEIGHTS = (0.5, 0.3, 0.2)
@@ -76,7 +75,8 @@ class PartSettings:
             raise InputError(
                 f"least_view_transmission is {self.least_view_transmission}; a share from 0 to below 1 is needed"
             )
-        require_count("sweeps", self.sweeps)
+        if not (self.sweeps >= 1 and int(self.sweeps) == self.sweeps):
+            raise InputError(f"sweeps is {self.sweeps}; a whole number from 1 is needed")
         for name in ("margin", "readout", "blur", "room"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise InputError(f"{name} is {getattr(self, name)}; a number from 0 is needed")
