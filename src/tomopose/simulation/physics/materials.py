@@ -90,21 +90,22 @@ def table(name: str) -> tuple[tuple[str, ...], Array]:
     return tuple(lines[0].split(",")), values
 
 
-def _xraydb() -> Any:
+def xraydb() -> Any:
+    """The module xraydb; EngineMissingError, with the line that installs it, where it is missing."""
     try:
-        import xraydb
+        import xraydb as module
     except ImportError as error:
         raise EngineMissingError(
             "this element needs xraydb, which is not installed", install_line='pip install "tomopose[sim]"'
         ) from error
-    return xraydb
+    return module
 
 
 def _atomic_weight(element: str) -> float:
     if element in ATOMIC_WEIGHT:
         return ATOMIC_WEIGHT[element]
     try:
-        return float(_xraydb().atomic_mass(element))
+        return float(xraydb().atomic_mass(element))
     except ValueError as error:
         raise InputError(f"{element!r} is no chemical element") from error
 
@@ -115,7 +116,7 @@ def _mass_attenuation(element: str, energy: Array) -> Array:
     if element in names[1:] and energy.size and energy.min() >= grid[0] and energy.max() <= grid[-1]:
         return np.exp(np.interp(np.log(energy), np.log(grid), np.log(values[:, names.index(element)])))
     try:
-        return np.asarray(_xraydb().mu_elam(element, energy * 1e3, kind="total"), dtype=np.float64)
+        return np.asarray(xraydb().mu_elam(element, energy * 1e3, kind="total"), dtype=np.float64)
     except ValueError as error:
         raise InputError(f"{element!r} is no chemical element") from error
 
@@ -140,13 +141,19 @@ MATERIALS: Mapping[str, Material] = MappingProxyType(
 """Materials by name; a scene may define more."""
 
 
+def known_material(material: Material | str, materials: Mapping[str, Material] = MATERIALS) -> Material:
+    """The material of that name; InputError names those that are known."""
+    if not isinstance(material, str):
+        return material
+    try:
+        return materials[material]
+    except KeyError:
+        raise InputError(f"material {material!r} is unknown; known are {', '.join(sorted(materials))}") from None
+
+
 def attenuation(material: Material | str, energy: ArrayLike, *, materials: Mapping[str, Material] = MATERIALS) -> Array:
     """Linear attenuation coefficient, 1/mm, at energies (n,), keV."""
-    if isinstance(material, str):
-        try:
-            material = materials[material]
-        except KeyError:
-            raise InputError(f"material {material!r} is unknown; known are {', '.join(sorted(materials))}") from None
+    material = known_material(material, materials)
     energy = np.asarray(energy, dtype=np.float64)
     mu = sum(share * _mass_attenuation(element, energy) for element, share in material.fractions.items())
     return np.asarray(mu) * material.density * CM2_PER_G_TO_MM

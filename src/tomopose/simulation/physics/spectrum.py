@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike
 
 from tomopose.errors import EngineMissingError, InputError, ShapeError
 from tomopose.simulation.physics.attenuation import tabulated
-from tomopose.simulation.physics.materials import MATERIALS, Material, attenuation, table
+from tomopose.simulation.physics.materials import MATERIALS, Material, attenuation, known_material, table
+from tomopose.simulation.physics.scintillator import deposited_energy
 from tomopose.units import Array, float_array
 from tomopose.values import value
 
@@ -74,13 +75,25 @@ class Spectrum:
         return replace(self, weight=self.weight * passed, filters=(*self.filters, (material, thickness)))
 
     def absorbed_energy(
-        self, material: Material | str, thickness: float, materials: Mapping[str, Material] = MATERIALS
+        self,
+        material: Material | str,
+        thickness: float,
+        materials: Mapping[str, Material] = MATERIALS,
+        *,
+        escape: bool = False,
     ) -> Spectrum:
-        """As an energy-integrating scintillator of that material and thickness (mm) weighs it."""
+        """As an energy-integrating scintillator of that material and thickness (mm) weighs it.
+
+        escape: K fluorescence and Compton-scattered photons that leave the scintillator carry their energy away (needs
+        xraydb); otherwise all energy stays of photons that interact.
+        """
         if not thickness > 0:
             raise InputError(f"scintillator: thickness is {thickness} mm; a positive number is needed")
-        absorbed = 1 - np.exp(-attenuation(material, self.energy, materials=materials) * thickness)
-        return replace(self, weight=self.weight * absorbed * self.energy, scintillator=(material, thickness))
+        if escape:
+            energy = deposited_energy(known_material(material, materials), thickness, self.energy)
+        else:
+            energy = self.energy * (1 - np.exp(-attenuation(material, self.energy, materials=materials) * thickness))
+        return replace(self, weight=self.weight * energy, scintillator=(material, thickness))
 
 
 def tube_spectrum(voltage: float, *, anode: str = "W", anode_angle_deg: float = 12.0) -> Spectrum:

@@ -140,13 +140,13 @@ def _spectrum(scene: S.Scene, materials: Mapping[str, Material]) -> Spectrum:
                 f"{spectrum.energy[0]:g} to {spectrum.energy[-1]:g} keV"
             )
         return replace(spectrum, weight=spectrum.weight * np.interp(spectrum.energy, energy, response))
-    return spectrum.absorbed_energy(detector.scintillator, detector.thickness_mm, materials)
+    return spectrum.absorbed_energy(detector.scintillator, detector.thickness_mm, materials, escape=detector.escape)
 
 
 def _detector(part: S.DetectorPart, b: int) -> Detector:
     """The detector; a scene gives lengths in the unbinned detector's pixels, `Detector` takes most in the image's."""
     values = _without_units(part)
-    for name in ("scintillator", "thickness", "response"):
+    for name in ("scintillator", "thickness", "escape", "response"):
         del values[name]
     if values["snr"] is None:
         values["snr"] = 200.0

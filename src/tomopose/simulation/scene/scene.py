@@ -89,6 +89,9 @@ class DetectorPart(Part):
 
     scintillator: str = "CsI"
     thickness_mm: float = 0.6
+    escape: bool = Field(
+        False, description="K lines and scattered photons that leave the scintillator carry energy away; needs xraydb"
+    )
     response: str | None = Field(
         None, description="CSV with columns energy_keV, response, in place of the scintillator"
     )
