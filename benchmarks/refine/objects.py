@@ -155,6 +155,15 @@ def moved(P: np.ndarray, xi: np.ndarray) -> np.ndarray:
     return P @ T
 
 
+def slow_errors(n: int, panel: Panel) -> np.ndarray:
+    """L (n, 6, 60): motions (mm, rad) by unit errors of a hexapod that turns with the table, five harmonics of it."""
+    a = 2 * np.pi * np.arange(n) / n
+    px = panel.p_u * panel.d_SR / panel.d_SD
+    size = np.diag([0.35 * px] * 3 + [np.radians(0.12)] * 3)
+    waves = [f(k * a) for k in (1, 2, 3, 7, 14) for f in (np.cos, np.sin)]
+    return np.concatenate([wave[:, None, None] * size for wave in waves], axis=2)
+
+
 def errors(kind: str, n: int, seed: int, panel: Panel) -> np.ndarray:
     """xi (n, 6): white scatter of 1 px and 0.4 degrees, smooth errors as a hexapod makes them, one jump, or none."""
     rng = np.random.default_rng(seed)
@@ -163,10 +172,7 @@ def errors(kind: str, n: int, seed: int, panel: Panel) -> np.ndarray:
         return np.concatenate([rng.normal(size=(n, 3)) * px, np.radians(0.4) * rng.normal(size=(n, 3))], 1)
     xi = np.zeros((n, 6))
     if kind == "hexapod":
-        a = 2 * np.pi * np.arange(n) / n
-        for k in (1, 2, 3, 7, 14):
-            size = np.array([0.35 * px] * 3 + [np.radians(0.12)] * 3)
-            xi += size * (rng.normal(size=6) * np.cos(k * a)[:, None] + rng.normal(size=6) * np.sin(k * a)[:, None])
+        xi = slow_errors(n, panel) @ rng.normal(size=60)
     if kind == "jump":
         xi[n // 3] = np.concatenate([rng.normal(size=3), np.zeros(3)]) * 0.7 * px
     return xi

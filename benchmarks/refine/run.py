@@ -13,13 +13,17 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import objects
 
 import tomopose as tp
+import tomopose.refinement.run as refinement_run
 from tomopose.engines.cpu import processors
 from tomopose.reconstruction.run import line_integrals_of
 from tomopose.refinement.estimate import Steps, estimate
@@ -27,12 +31,17 @@ from tomopose.refinement.halves import matched_to
 from tomopose.refinement.joint_fit.fit import Fit, blank
 from tomopose.refinement.joint_fit.measured import measured
 from tomopose.refinement.joint_fit.pyramid import level_of
+from tomopose.refinement.prior import Prior, with_shared_errors
 from tomopose.refinement.stated import prior_of
 
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """One scan of 64 views of 109 x 101 px; voxel: mm, of 72^3; goal: px."""
+    """One scan of 64 views of 109 x 101 px; voxel: mm, of 72^3; goal: px.
+
+    covariance: the prior holds the covariance from which the slow errors were drawn, correlated over the views, as a
+    calibration that identified the manipulator states it; otherwise `tp.refine` knows nothing of the errors.
+    """
 
     name: str
     obj: str
@@ -43,6 +52,7 @@ class Case:
     hardening: float = 0.0
     seed: int = 0
     voxel: float = 0.28
+    covariance: bool = False
 
     def scan(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, objects.Panel]:
         return objects.scan(self.obj, self.way, self.errors, noise=self.noise, hardening=self.hardening, seed=self.seed)
@@ -62,6 +72,8 @@ CASES = (
     Case(name="object cut by the view", obj="cut", errors="white", goal="exit 3", voxel=0.32),
     Case(name="balls, hexapod", obj="balls", errors="hexapod", goal="0.06"),
     Case(name="step cylinder, hexapod", errors="hexapod", goal="0.06", **STEP),
+    Case(name="balls, hexapod, its covariance", obj="balls", errors="hexapod", goal="0.06", covariance=True),
+    Case(name="step cylinder, hexapod, its covariance", errors="hexapod", goal="0.06", covariance=True, **STEP),
     Case(name="balls, white, circle", obj="balls", errors="white", goal="2 x bound", way="circle", seed=1),
     Case(name="balls, white, sine", obj="balls", errors="white", goal="2 x bound", way="sine", seed=2),
     Case(name="step cylinder, white, sine", errors="white", goal="2 x bound", way="sine", seed=1, **STEP),
@@ -114,12 +126,26 @@ def coverage(result: tp.Refinement, P_true: np.ndarray, grid: tp.VoxelGrid) -> d
     }
 
 
+@contextmanager
+def known_covariance(panel: objects.Panel) -> Iterator[None]:
+    """`tp.refine` with the slow errors' covariance in its prior, where a calibration with poses would put it."""
+
+    def prior_with(*arguments: object) -> tuple[Prior, float]:
+        prior, px = prior_of(*arguments)  # type: ignore[arg-type]
+        L = objects.slow_errors(len(arguments[0]), panel)  # type: ignore[arg-type]
+        return with_shared_errors(prior, L, np.eye(L.shape[2])), px
+
+    with patch.object(refinement_run, "prior_of", prior_with):
+        yield
+
+
 def row_of(case: Case) -> dict[str, object]:
     """One case through `tp.refine` with its default settings."""
     images, P, truth, panel = case.scan()
     matrices, grid = matrices_of(P, panel), tp.VoxelGrid.cube(n=72, spacing=case.voxel)
     begin, used = time.time(), time.process_time()
-    result = tp.refine(images, matrices, grid, images_are="transmission")
+    with known_covariance(panel) if case.covariance else nullcontext():
+        result = tp.refine(images, matrices, grid, images_are="transmission")
     row: dict[str, object] = {
         "name": case.name,
         "goal": case.goal,
