@@ -2,7 +2,8 @@ r"""One nonlinear least-squares loop, and the status in which every one of the p
 
 Levenberg-Marquardt with the damping of Marquardt (1963): each step solves (N + lambda diag N) s = J^T r with
 N = J^T J.  A step that lowers the sum of squares is taken and lambda falls to a tenth; another one raises it tenfold.
-The unknowns are any value that a step moves: a pose, a shape, a calibration.
+The unknowns are any value that a step moves: a pose, a shape, a calibration.  Weights that depend on the unknowns are
+held during a step and renewed after it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ State = TypeVar("State")
 
 LEAST_DAMPING, LARGEST_DAMPING = 1e-15, 1e10
 """Below the first a step is one of Gauss and Newton to the last bit; beyond the second it moves nothing."""
+FIRST_DAMPING = 1e-6
+"""What a failed step of Gauss and Newton is followed by; less changes nothing that matters."""
 ROUNDING = 1e-13
 """Relative growth of the sum of squares that its own rounding explains."""
 UNSEEN = 1e-10
@@ -65,6 +68,7 @@ def least_squares(
     steps: int,
     tolerance: float,
     damping: float = 1e-3,
+    renewed: Callable[[State], State] | None = None,
 ) -> Solution[State]:
     """The least sum of squares reached from `start`.
 
@@ -75,6 +79,8 @@ def least_squares(
     moved:      (state, step (m,)) -> the state after the step.
     steps:      trials at the most.
     tolerance:  root mean square of J s, relative to that of r where this exceeds 1, of a step that ends the iteration.
+    damping:    lambda of the first step.
+    renewed:    the state with the weights that belong to it; None where they are constant.
     """
     state = start
     r, J = rows(state)
@@ -89,7 +95,7 @@ def least_squares(
     for _ in range(steps):
         step = _step(J, r, damping)
         if step is None:
-            damping *= 10
+            damping = max(damping * 10, FIRST_DAMPING)
             if damping > LARGEST_DAMPING:
                 return ended(Status.SINGULAR)
             continue
@@ -100,9 +106,13 @@ def least_squares(
         cost_new = _sum_of_squares(r_new)
         if cost_new <= cost * (1 + ROUNDING):
             state, r, J, cost, damping = trial, r_new, J_new, cost_new, max(damping / 10, LEAST_DAMPING)
+            if renewed is not None:
+                state = renewed(state)
+                r, J = rows(state)
+                cost = _sum_of_squares(r)
         else:
             short = short or _unseen(J, r, cost)
-            damping *= 10
+            damping = max(damping * 10, FIRST_DAMPING)
         if short:
             return ended(Status.CONVERGED)
         if damping > LARGEST_DAMPING:
@@ -123,11 +133,15 @@ def _unseen(J: Array, r: Array, cost: float) -> bool:
 
 
 def _step(J: Array, r: Array, damping: float) -> Array | None:
-    """The damped step (m,); None where the matrix is singular."""
+    """The damped step (m,), solved with columns of length 1; None where the matrix is singular."""
+    lengths = np.linalg.norm(J, axis=0)
+    if not (lengths > 0).all():
+        return None
+    J = J / lengths
     N = J.T @ J
     N[np.diag_indices(len(N))] *= 1 + damping
     try:
-        step = np.asarray(np.linalg.solve(N, J.T @ r), dtype=np.float64)
+        step = np.asarray(np.linalg.solve(N, J.T @ r) / lengths, dtype=np.float64)
     except np.linalg.LinAlgError:
         return None
     return step if np.isfinite(step).all() else None

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg import solve_triangular
 
 from tomopose.calibration.model.ball_projection import (
     SCANNER_COLUMNS,
@@ -40,18 +40,18 @@ from tomopose.errors import NotConvergedError, TrajectoryError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.least_squares import Solution, Status, least_squares
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import ErrorModel, Repeatability
 from tomopose.manipulator.twin import TwinRobots
 from tomopose.units import Array
 
 STEPS = 50
-COST_TOLERANCE, VALLEY_TOLERANCE = 1e-6, 1e-4
-"""Relative to the number of equations: a step that gains less than the first in chi2 ends the iteration; the second, a
-fifth of a standard deviation at most, is accepted after all steps in a flat valley."""
+STEP_TOLERANCE, VALLEY_TOLERANCE = 1e-3, 1e-4
+"""A step that moves the residuals by less than the first, rms in standard deviations, ends it; where a valley
+is flat, a promised gain in chi2 below the second for each equation is enough (0.2 standard deviations at most)."""
 EXACT = 1e-10
 """mm and rad: standard deviation of a mount that is known by definition."""
-LEAST_DAMPING, LARGEST_DAMPING = 1e-6, 1e8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +143,6 @@ class MapEstimate:
     chi2: float
     dof: int
     log_evidence: float
-    steps: int
 
 
 def linearise(problem: KinematicProblem, state: State) -> Linearised:
@@ -251,15 +250,17 @@ def _bar_rows(problem: KinematicProblem, state: State) -> tuple[Array, Array]:
     return np.array(r), np.reshape(rows, (len(r), len(problem.tangent)))
 
 
-def _weighted(
-    problem: KinematicProblem, state: State, W: Array | None = None
-) -> tuple[Array, Array, Linearised, Array]:
-    """All residuals and rows in standard deviations: observations, bars, priors; the linearisation; whiteners.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Point:
+    """A state, its linearisation (None where no machine or scanner has such errors), and the whiteners in use."""
 
-    W (n, 2, 2): whiteners to use; None: those of this state.
-    """
-    at = linearise(problem, state)
-    W = whiteners(at.C) if W is None else W
+    state: State
+    at: Linearised | None
+    W: Array
+
+
+def _weighted(problem: KinematicProblem, state: State, at: Linearised, W: Array) -> tuple[Array, Array]:
+    """All residuals and rows in standard deviations: observations whitened by W (n, 2, 2), bars, priors."""
     m = at.J.shape[2]
     r_bar, J_bar = _bar_rows(problem, state)
     sigma = problem.prior_sigma
@@ -268,11 +269,53 @@ def _weighted(
     J_prior = np.zeros((len(held), m))
     J_prior[np.arange(len(held)), held] = 1 / sigma[held]
     r = np.concatenate([(W @ at.r[:, :, None])[..., 0].ravel(), r_bar, -(value / sigma)[held]])
-    return r, np.concatenate([(W @ at.J).reshape(-1, m), J_bar, J_prior]), at, W
+    return r, np.concatenate([(W @ at.J).reshape(-1, m), J_bar, J_prior])
 
 
-def _factor(J: Array, damping: float = 0.0) -> tuple[Array, Array] | None:
-    """Cholesky's L of J^T J with columns of length 1 (plus damping), and those lengths; None where it is singular.
+def solve_map(problem: KinematicProblem, start: State, *, steps: int = STEPS, unfinished: bool = False) -> MapEstimate:
+    """Least squares from `start`, the weights renewed after every step; at most `steps` of them are tried.
+
+    unfinished: where no optimum is reached, the state that was; otherwise NotConvergedError.
+    """
+
+    def rows(point: _Point) -> tuple[Array, Array]:
+        if point.at is None:
+            return np.full(1, np.nan), np.zeros((1, 0))
+        return _weighted(problem, point.state, point.at, point.W)
+
+    def moved(point: _Point, step: Array) -> _Point:
+        try:
+            state = point.state.moved(step)
+            return _Point(state=state, at=linearise(problem, state), W=point.W)
+        except (TrajectoryError, ImpossibleScannerError):
+            return replace(point, at=None)
+
+    def renewed(point: _Point) -> _Point:
+        return point if point.at is None else replace(point, W=whiteners(point.at.C))
+
+    at = linearise(problem, start)
+    begin = _Point(state=start, at=at, W=whiteners(at.C))
+    found = least_squares(rows, moved, begin, steps=steps, tolerance=STEP_TOLERANCE, damping=0.0, renewed=renewed)
+    if found.status is Status.NO_START:
+        raise NotConvergedError("at the start a ball lies behind the source; the start is too far off")
+    if not (unfinished or found.status is Status.CONVERGED or _promised(found) < VALLEY_TOLERANCE * len(found.r)):
+        raise NotConvergedError(f"{found.status.value}: chi2 is {found.cost:.6g} for {len(found.r)} equations")
+    assert found.state.at is not None
+    return _estimate(problem, found.state.state, found.r, found.J, found.state.at)
+
+
+def _promised(found: Solution[_Point]) -> float:
+    """What chi2 would still fall by, were the problem linear; infinite where a direction is open."""
+    factor = _factor(found.J)
+    if factor is None:
+        return np.inf
+    L, scale = factor
+    z = solve_triangular(L, found.J.T @ found.r / scale, lower=True)
+    return float(z @ z)
+
+
+def _factor(J: Array) -> tuple[Array, Array] | None:
+    """Cholesky's L of J^T J with columns of length 1, and those lengths; None where it is singular.
 
     The priors keep the condition of J below 1e5, so that its square is harmless; a factor is ten times faster than an
     SVD of some hundred equations.
@@ -280,63 +323,13 @@ def _factor(J: Array, damping: float = 0.0) -> tuple[Array, Array] | None:
     N = J.T @ J
     lengths = np.sqrt(np.diag(N))
     scale: Array = np.where(lengths > 0, lengths, 1.0)
-    N = N / scale[:, None] / scale
-    N[np.diag_indices(len(N))] += damping
     try:
-        return np.asarray(np.linalg.cholesky(N), dtype=np.float64), scale
+        return np.asarray(np.linalg.cholesky(N / scale[:, None] / scale), dtype=np.float64), scale
     except np.linalg.LinAlgError:
         return None
 
 
-def solve_map(problem: KinematicProblem, start: State, *, steps: int = STEPS, unfinished: bool = False) -> MapEstimate:
-    """Levenberg-Marquardt from `start`, the weights renewed at every step, of which there are at most `steps`.
-
-    unfinished: where no optimum is reached, the state that was; otherwise NotConvergedError.
-    """
-    state, damping, drop = start, 0.0, np.inf
-    r, J, at, W = _weighted(problem, state)
-    if not np.isfinite(r).all():
-        raise NotConvergedError("at the start a ball lies behind the source; the start is too far off")
-    for step in range(1, steps + 1):
-        while True:
-            factor = _factor(J, damping)
-            drop = -np.inf
-            if factor is not None:
-                L, scale = factor
-                trial = state.moved(cho_solve((L, True), J.T @ r / scale) / scale)
-                try:
-                    new = _weighted(problem, trial, W)
-                    drop = float(r @ r - new[0] @ new[0]) if np.isfinite(new[0]).all() else -np.inf
-                except (TrajectoryError, ImpossibleScannerError):  # no machine, or no scanner, has such errors
-                    drop = -np.inf
-            if drop > -COST_TOLERANCE * len(r):
-                break
-            damping = max(damping * 10, LEAST_DAMPING)
-            if damping > LARGEST_DAMPING:
-                if unfinished:
-                    return _estimate(problem, state, r, J, at, step)
-                raise NotConvergedError(f"step {step}: no direction lowers chi2 = {r @ r:.6g}, and it is no optimum")
-        state, at = trial, new[2]
-        W = whiteners(at.C)
-        r, J = _reweighted(problem, new[0], new[1], at, W)
-        if abs(drop) < COST_TOLERANCE * len(r) and damping < 1.0:
-            return _estimate(problem, state, r, J, at, step)
-        damping = damping / 10 if damping > LEAST_DAMPING else 0.0
-    if unfinished or abs(drop) < VALLEY_TOLERANCE * len(r):
-        return _estimate(problem, state, r, J, at, steps)
-    raise NotConvergedError(f"no optimum after {steps} steps; the last one still gained {drop:.3g} in chi2")
-
-
-def _reweighted(problem: KinematicProblem, r: Array, J: Array, at: Linearised, W: Array) -> tuple[Array, Array]:
-    """Rows r and J with the observations' part whitened by W; bars and priors stay."""
-    k = at.r.size
-    return (
-        np.concatenate([(W @ at.r[:, :, None]).ravel(), r[k:]]),
-        np.concatenate([(W @ at.J).reshape(k, -1), J[k:]]),
-    )
-
-
-def _estimate(problem: KinematicProblem, state: State, r: Array, J: Array, at: Linearised, steps: int) -> MapEstimate:
+def _estimate(problem: KinematicProblem, state: State, r: Array, J: Array, at: Linearised) -> MapEstimate:
     factor = _factor(J)
     if factor is None:
         raise NotConvergedError("the poses leave a direction of the unknowns undetermined; free fewer parameters")
@@ -355,7 +348,6 @@ def _estimate(problem: KinematicProblem, state: State, r: Array, J: Array, at: L
         chi2=chi2,
         dof=len(r) - J.shape[1],
         log_evidence=-0.5 * (chi2 + log_det_C + 2 * float(np.sum(np.log(held))) + log_det),
-        steps=steps,
     )
 
 
@@ -366,7 +358,9 @@ def linear_fit(estimate: MapEstimate) -> LinearFit:
 
 def linear_at(problem: KinematicProblem, state: State) -> LinearFit:
     """The same of any rows at any state, such as all rows at the optimum of those that were used."""
-    r, J, at, W = _weighted(problem, state)
+    at = linearise(problem, state)
+    W = whiteners(at.C)
+    r, J = _weighted(problem, state, at, W)
     k = at.r.size
     return LinearFit(
         problem=problem.data,
@@ -382,6 +376,6 @@ def linear_at(problem: KinematicProblem, state: State) -> LinearFit:
 
 def singular_values(estimate: MapEstimate) -> Array:
     """(m,) of the weighted Jacobian with its priors, columns of length 1, largest first."""
-    _, J, _, _ = _weighted(estimate.problem, estimate.state)
+    _, J = _weighted(estimate.problem, estimate.state, estimate.at, whiteners(estimate.at.C))
     s: Array = np.linalg.svd(J / np.maximum(np.linalg.norm(J, axis=0), 1e-300), compute_uv=False)
     return s
