@@ -3,10 +3,10 @@
 The scenarios of the toolbox state the tube of the other tests: tungsten, electrons in and beam out at 45 degrees, a
 window of 4 mm of aluminium. They name spectrum files that are not published, and the model that made them is not
 published as code. The models of spekpy at 45 degrees differ by more than these tests allow, so that the stated angle
-does not determine a spectrum. Two numbers of the one tube are therefore determined from two references, at 120 and
-200 kV: anode angle and thickness of the aluminium window for which spekpy's spectra give the Monte Carlo ratios between
-the steps of the aluminium wedge, without filter, before the ideal detector. The references of iron, of both wedges
-behind copper and of the scintillators play no part in it.
+does not determine a spectrum. Two numbers of the one tube are therefore determined: anode angle and thickness of the
+aluminium window for which spekpy's spectra come nearest to the Monte Carlo ratios between the steps of the wedges
+before the ideal detector, five references at 120 and 200 kV, of aluminium and iron, with and without copper. The
+references of the scintillators play no part in it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from ctsimu.evaluation.test2D_SW_1 import Test2D_SW_1_results
 from ctsimu.evaluation.test2D_SW_2 import Test2D_SW_2_results
 from images import wedge_materials
-from samples import ALUMINIUM
+from samples import ALUMINIUM, IRON
 from scipy.optimize import minimize_scalar
 
 from tomopose.simulation.physics.materials import attenuation
@@ -40,11 +40,43 @@ class TubeModel:
         return bare.filtered("Al", self.window, wedge_materials())
 
 
-REFERENCES = {
-    120.0: (Test2D_SW_1_results, "09_Al_noFilter_120kV-poly_Ideal"),
-    200.0: (Test2D_SW_2_results, "01_Al_noFilter_200kV-poly_Ideal"),
-}
-"""For each voltage, kV: the toolbox's class and the name of its reference."""
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Grey values behind the steps of a wedge before the ideal detector; copper: mm."""
+
+    voltage: float
+    wedge: str
+    copper: float
+    results: type
+    name: str
+
+    @property
+    def ratios(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of neighbouring steps, and their error bars."""
+        read = self.results()
+        read.loadReference(self.name)
+        grey, error = np.array(read.means_mc_primary), np.array(read.error_mc_primary_upper)
+        wanted = grey[1:] / grey[:-1]
+        return wanted, wanted * np.hypot(error[1:] / grey[1:], error[:-1] / grey[:-1])
+
+    def misfit(self, bare: Spectrum, window: float) -> float:
+        """Sum of squared deviations of the spectrum behind the window, in units of the error bars."""
+        materials, (wanted, bars) = wedge_materials(), self.ratios
+        passed = bare.filtered("Al", window, materials).filtered("Cu", self.copper, materials)
+        lengths = np.array([*WEDGES[self.wedge], 0.0])
+        mu = attenuation(self.wedge, passed.energy, materials=materials)
+        ours = np.exp(-np.outer(lengths, mu)) @ (passed.weight * passed.energy)
+        return float(np.sum(((ours[1:] / ours[:-1] - wanted) / bars) ** 2))
+
+
+WEDGES = {"Al": ALUMINIUM, "Fe": IRON}
+REFERENCES = (
+    Reference(120.0, "Al", 0.0, Test2D_SW_1_results, "09_Al_noFilter_120kV-poly_Ideal"),
+    Reference(200.0, "Al", 0.0, Test2D_SW_2_results, "01_Al_noFilter_200kV-poly_Ideal"),
+    Reference(200.0, "Al", 2.0, Test2D_SW_2_results, "02_Al_CuFilter_200kV-poly_Ideal"),
+    Reference(200.0, "Fe", 0.0, Test2D_SW_2_results, "03_Fe_noFilter_200kV-poly_Ideal"),
+    Reference(200.0, "Fe", 2.0, Test2D_SW_2_results, "04_Fe_CuFilter_200kV-poly_Ideal"),
+)
 DETECTORS: dict[str, tuple[str, float] | None] = {
     "D1": None,
     "D2": ("CsI", 0.2),
@@ -70,36 +102,17 @@ def seen_by(photons: Spectrum, detector: str) -> Spectrum:
 
 @functools.cache
 def tube_model() -> TubeModel:
-    """Least sum of squared deviations from both references' ratios of steps, in units of their error bars."""
-    wanted = {voltage: _steps(voltage) for voltage in REFERENCES}
+    """Least sum of squared deviations from all references' ratios of steps, in units of their error bars."""
 
     @functools.cache
     def best_window(angle: float) -> tuple[float, float]:
-        felt = {voltage: seen_by(tube_spectrum(voltage, anode_angle_deg=angle), "D1") for voltage in REFERENCES}
-
-        def misfit(window: float) -> float:
-            return sum(_misfit(felt[voltage], window, *wanted[voltage]) for voltage in REFERENCES)
-
-        best = minimize_scalar(misfit, bounds=WINDOWS, method="bounded")
+        bare = {v: tube_spectrum(v, anode_angle_deg=angle) for v in {r.voltage for r in REFERENCES}}
+        best = minimize_scalar(
+            lambda window: sum(r.misfit(bare[r.voltage], window) for r in REFERENCES), bounds=WINDOWS, method="bounded"
+        )
         return float(best.fun), float(best.x)
 
     angle = float(
         minimize_scalar(lambda x: best_window(float(x))[0], bounds=ANGLES, method="bounded", options={"xatol": 0.05}).x
     )
     return TubeModel(angle=angle, window=best_window(angle)[1])
-
-
-def _steps(voltage: float) -> tuple[np.ndarray, np.ndarray]:
-    """The reference's ratios of neighbouring steps of the aluminium wedge, and their error bars."""
-    reference, name = REFERENCES[voltage]
-    read = reference()
-    read.loadReference(name)
-    grey, error = np.array(read.means_mc_primary), np.array(read.error_mc_primary_upper)
-    wanted = grey[1:] / grey[:-1]
-    return wanted, wanted * (error[1:] / grey[1:] + error[:-1] / grey[:-1])
-
-
-def _misfit(felt: Spectrum, window: float, wanted: np.ndarray, bars: np.ndarray) -> float:
-    mu = attenuation("Al", felt.energy, materials=wedge_materials())
-    ours = np.exp(-np.outer(np.array([*ALUMINIUM, 0.0]) + window, mu)) @ felt.weight
-    return float(np.sum(((ours[1:] / ours[:-1] - wanted) / bars) ** 2))
