@@ -46,8 +46,9 @@ from tomopose.manipulator.real_poses import ErrorModel, Repeatability
 from tomopose.manipulator.twin import TwinRobots
 from tomopose.units import Array
 
-STEPS = 50
-STEP_TOLERANCE, VALLEY_TOLERANCE = 1e-3, 1e-4
+STEPS = 150
+"""Trials at the most; three gross errors among 189 poses of a hexapod take 70 of them."""
+STEP_TOLERANCE, VALLEY_TOLERANCE = 1e-4, 1e-4
 """A step that moves the residuals by less than the first, rms in standard deviations, ends it; where a valley
 is flat, a promised gain in chi2 below the second for each equation is enough (0.2 standard deviations at most)."""
 EXACT = 1e-10
