@@ -54,7 +54,7 @@ def _window(sigma: float) -> float:
 def _profiles(response: SartResponse, x: Array, n: Array, sigma: float) -> tuple[Array, Array, Array]:
     """(places s (k,) in voxels, samples (m, k, 3) mm, grey levels (m, k)) along normals n from points x (m, 3)."""
     window = _window(sigma)
-    s = np.arange(2 * round(window / kernel.STEP) + 1) * kernel.STEP - window
+    s = np.linspace(-window, window, 2 * round(window / kernel.STEP) + 1, dtype=np.float64)
     samples = x[:, None] + response.voxel * s[None, :, None] * n[:, None]
     return s, samples, response.at(samples.reshape(-1, 3)).reshape(len(x), len(s))
 

@@ -124,7 +124,7 @@ def _from_noise(
         if n_size:
             sizes[i] = np.sqrt(C[k + n_place, k + n_place]) if clear[target.name] else np.inf
         k += n_place + n_size
-    of = np.sqrt(np.diag(C)[k:])
+    of: Array = np.sqrt(np.diag(C)[k:])
     known = [all(clear[f] for f in m.of) for m in wanted]
     return u, sizes, {m.name: float(x) if c else np.inf for m, x, c in zip(wanted, of, known, strict=True)}
 
@@ -144,7 +144,7 @@ def _spread(edges: Mapping[str, ExpectedEdges], weights: Mapping[str, Array]) ->
 
 def _parameters(target: Target) -> Array:
     """(p, m): by how much the parameters of `derivatives` move with each point's edge along its normal."""
-    inverse: Array = np.linalg.pinv(target.derivatives())
+    inverse: Array = np.asarray(np.linalg.pinv(target.derivatives()), dtype=np.float64)
     if target.shape is None:
         return inverse
     return -inverse * target.outward

@@ -47,7 +47,8 @@ class Target:
         y = self.x - self.shape.point
         if self.shape.kind != "sphere":
             y = y - np.outer(y @ self.shape.frame[2], self.shape.frame[2])
-        return np.sign(np.einsum("mc,mc->m", y, self.n))
+        side: Array = np.sign(np.einsum("mc,mc->m", y, self.n))
+        return side
 
     @property
     def along(self) -> Array:
