@@ -9,32 +9,47 @@ beyond the border (`STEEP`).  Layouts and index rules: layout.py.
 from __future__ import annotations
 
 import math
+from typing import TypeAlias
 
 import numpy as np
 from numba import njit
 
 from tomopose.engines.layout import BORDER, F32, MARGIN, TILE, Lookup, Support, clip_range, whole_between
-from tomopose.engines.vector import W, back_block, back_block_inverse_square
+from tomopose.engines.vector import BLOCKS, W, back_blocks, back_blocks_inverse_square
+
+Line: TypeAlias = tuple[float, float, float, float, float, float]
+"""a_u, b_u, a_v, b_v, a_w, b_w of `column_image`."""
 
 STEEP = 2.0**20
 """Pixels times w_max / w_min of a column's layers up to which a vector block is used.
 
-A block's float32 depth is off by 2 eps w_max at most, eps = 2^-24, its quotient u (counted from a pixel of the
-detector) by u (2 eps w_max / w_min + 2 eps) < 4 eps n w_max / w_min: a quarter of a pixel at the limit.  The border
-beyond the last seen place is one pixel wide.
+With eps = 2^-24 the float32 depth of a call's layers is off by 2 eps w_max at most, the numerator of u (counted from a
+pixel of the detector) by 2 eps n w_max, their quotient by 4 eps n w_max / w_min: a quarter of a pixel at the limit.  The
+border beyond the last seen place is one pixel wide.
 """
 
 
+@njit(cache=True, nogil=True, inline="always")
+def column_image(P: np.ndarray, j: int, x: int, y: int) -> Line:
+    """a_u .. b_w: view j has layer z of column (x, y) at u = (a_u + b_u z) / w, v = (a_v + b_v z) / w, w = a_w + b_w z."""
+    return (
+        P[j, 0, 0] * x + P[j, 0, 1] * y + P[j, 0, 3],
+        P[j, 0, 2],
+        P[j, 1, 0] * x + P[j, 1, 1] * y + P[j, 1, 3],
+        P[j, 1, 2],
+        P[j, 2, 0] * x + P[j, 2, 1] * y + P[j, 2, 3],
+        P[j, 2, 2],
+    )
+
+
 @njit(cache=True, nogil=True)
-def seen_layers(P: np.ndarray, x: int, y: int, n_z: int, n_u: int, n_v: int) -> tuple[int, int]:
-    """Layers z_0 <= z < z_1 of column (x, y) that fall strictly within one pixel of the detector.
+def seen_layers(line: Line, n_z: int, n_u: int, n_v: int) -> tuple[int, int]:
+    """Layers z_0 <= z < z_1 of a column that fall strictly within one pixel of the detector.
 
     u > -1 is (P_0 + P_2) X > 0, and so on: four linear inequalities in z.  The two of u add up to (n_u + 1) w > 0, so
     that what lies behind the source is not seen.
     """
-    a_u, b_u = P[0, 0] * x + P[0, 1] * y + P[0, 3], P[0, 2]
-    a_v, b_v = P[1, 0] * x + P[1, 1] * y + P[1, 3], P[1, 2]
-    a_w, b_w = P[2, 0] * x + P[2, 1] * y + P[2, 3], P[2, 2]
+    a_u, b_u, a_v, b_v, a_w, b_w = line
     # Most columns are seen whole: where both ends are, so is all between, and no division is needed.
     top = n_z - 1
     u, v, w = a_u + b_u * top, a_v + b_v * top, a_w + b_w * top
@@ -58,85 +73,59 @@ def seen_layers(P: np.ndarray, x: int, y: int, n_z: int, n_u: int, n_v: int) -> 
 
 @njit(cache=True, nogil=True)
 def _back_column_vector(
-    column: np.ndarray,
-    at: int,
-    P: np.ndarray,
-    x: int,
-    y: int,
-    z_0: int,
-    z_1: int,
-    image: np.ndarray,
-    detector: tuple[int, int],
-    scale: float,
-    inverse_square: bool,
+    column: np.ndarray, at: int, line: Line, layers: tuple[int, int], look: Lookup, j: int, scale: float
 ) -> None:
-    """Add one view to layers z_0 <= z < z_1 of a column that begins at column[at]; the column has at least W layers."""
-    a_u = P[0, 0] * x + P[0, 1] * y + P[0, 3]
-    a_v = P[1, 0] * x + P[1, 1] * y + P[1, 3]
-    a_w = P[2, 0] * x + P[2, 1] * y + P[2, 3]
-    n_u, n_v = detector
+    """Add view j to layers z_0 <= z < z_1 of a column that begins at column[at]; the column has at least W layers."""
+    a_u, b_u, a_v, b_v, a_w, b_w = line
+    z_0, z_1 = layers
+    n_u, n_v = look.n_u, look.n_v
     row = n_v + 2 * BORDER
-    w_0, w_1 = a_w + P[2, 2] * z_0, a_w + P[2, 2] * (z_1 - 1)
+    w_0, w_1 = a_w + b_w * z_0, a_w + b_w * (z_1 - 1)
     if not max(w_0, w_1) * max(n_u, n_v) < STEEP * min(w_0, w_1):
-        _back_column_plain(column, at, P, x, y, z_0, z_1, image, detector, scale, inverse_square)
+        _back_column_plain(column, at, line, layers, look, j, scale)
         return
     middle = 0.5 * (z_0 + z_1 - 1)
-    w = a_w + P[2, 2] * middle
     # Counting from a pixel near the column's middle keeps the float32 quotients of a block small, therefore exact.
-    reciprocal = 1.0 / w
-    u_ref = math.floor(min(max((a_u + P[0, 2] * middle) * reciprocal, -1.0), float(n_u)))
-    v_ref = math.floor(min(max((a_v + P[1, 2] * middle) * reciprocal, -1.0), float(n_v)))
-    a_u -= u_ref * a_w
-    a_v -= v_ref * a_w
-    b_u, b_v = P[0, 2] - u_ref * P[2, 2], P[1, 2] - v_ref * P[2, 2]
-    base = (u_ref + BORDER) * row + v_ref + BORDER
+    reciprocal = 1.0 / (a_w + b_w * middle)
+    u_ref = math.floor(min(max((a_u + b_u * middle) * reciprocal, -1.0), float(n_u)))
+    v_ref = math.floor(min(max((a_v + b_v * middle) * reciprocal, -1.0), float(n_v)))
+    a_u, b_u = a_u - u_ref * a_w, b_u - u_ref * b_w
+    a_v, b_v = a_v - v_ref * a_w, b_v - v_ref * b_w
+    base = j * look.images.shape[1] + (u_ref + BORDER) * row + v_ref + BORDER
     z = z_0
     while z < z_1:
         start = min(z, z_1 - W)
         start = max(start, 0)  # the column is shorter than a block above z_1: lanes beyond it are cut below
         if start + W > z_1:
-            _back_column_plain(column, at, P, x, y, z, z_1, image, detector, scale, inverse_square)
+            _back_column_plain(column, at, line, (z, z_1), look, j, scale)
             return
-        first = z - start
-        u, v, w = a_u + b_u * start, a_v + b_v * start, a_w + P[2, 2] * start
-        place = (F32(scale), F32(u), F32(b_u), F32(v), F32(b_v), F32(w), F32(P[2, 2]))
-        if inverse_square:
-            back_block_inverse_square(column, at + start, image, base, np.int32(row), np.int32(first), place)
+        blocks = min((z_1 - start) // W, BLOCKS) if BLOCKS > 1 else 1
+        u, v, w = a_u + b_u * start, a_v + b_v * start, a_w + b_w * start
+        place = (F32(scale), F32(u), F32(b_u), F32(v), F32(b_v), F32(w), F32(b_w))
+        if look.inverse_square:
+            back_blocks_inverse_square(column, at + start, look.images, base, np.int32(row), (z - start, blocks), place)
         else:
-            back_block(column, at + start, image, base, np.int32(row), np.int32(first), place)
-        z = start + W
+            back_blocks(column, at + start, look.images, base, np.int32(row), (z - start, blocks), place)
+        z = start + blocks * W
 
 
 @njit(cache=True, nogil=True)
 def _back_column_plain(
-    column: np.ndarray,
-    at: int,
-    P: np.ndarray,
-    x: int,
-    y: int,
-    z_0: int,
-    z_1: int,
-    image: np.ndarray,
-    detector: tuple[int, int],
-    scale: float,
-    inverse_square: bool,
+    column: np.ndarray, at: int, line: Line, layers: tuple[int, int], look: Lookup, j: int, scale: float
 ) -> None:
     """The same without vectors."""
-    a_u = P[0, 0] * x + P[0, 1] * y + P[0, 3]
-    a_v = P[1, 0] * x + P[1, 1] * y + P[1, 3]
-    a_w = P[2, 0] * x + P[2, 1] * y + P[2, 3]
-    n_u, n_v = detector
-    row = n_v + 2 * BORDER
-    for z in range(z_0, z_1):
-        reciprocal = 1.0 / (a_w + P[2, 2] * z)
-        u = min(max((a_u + P[0, 2] * z) * reciprocal, -1.0), float(n_u)) + BORDER
-        v = min(max((a_v + P[1, 2] * z) * reciprocal, -1.0), float(n_v)) + BORDER
-        i, j = int(u), int(v)
-        f_u, f_v = F32(u - i), F32(v - j)
-        p = i * row + j
-        low = image[p] + f_v * (image[p + 1] - image[p])
-        high = image[p + row] + f_v * (image[p + row + 1] - image[p + row])
-        weight = F32(scale * reciprocal * reciprocal) if inverse_square else F32(scale)
+    a_u, b_u, a_v, b_v, a_w, b_w = line
+    images, row = look.images, look.n_v + 2 * BORDER
+    for z in range(layers[0], layers[1]):
+        reciprocal = 1.0 / (a_w + b_w * z)
+        u = min(max((a_u + b_u * z) * reciprocal, -1.0), float(look.n_u)) + BORDER
+        v = min(max((a_v + b_v * z) * reciprocal, -1.0), float(look.n_v)) + BORDER
+        i, k = int(u), int(v)
+        f_u, f_v = F32(u - i), F32(v - k)
+        p = i * row + k
+        low = images[j, p] + f_v * (images[j, p + 1] - images[j, p])
+        high = images[j, p + row] + f_v * (images[j, p + row + 1] - images[j, p + row])
+        weight = F32(scale * reciprocal * reciprocal) if look.inverse_square else F32(scale)
         column[at + z] += weight * (low + f_u * (high - low))
 
 
@@ -157,9 +146,9 @@ def _add_views(
 
     counts: (n_z + 1,) gets +1 where the layers begin that a view sees, and -1 where they end; empty: not counted.
     """
-    detector = (look.n_u, look.n_v)
     for j in range(len(look.P)):
-        z_0, z_1 = seen_layers(look.P[j], x, y, n_z, look.n_u, look.n_v)
+        line = column_image(look.P, j, x, y)
+        z_0, z_1 = seen_layers(line, n_z, look.n_u, look.n_v)
         z_0, z_1 = max(z_0, low), min(z_1, high)
         if z_1 <= z_0:
             continue
@@ -167,13 +156,9 @@ def _add_views(
             counts[z_0] += 1
             counts[z_1] -= 1
         if look.vector:
-            _back_column_vector(
-                column, at, look.P[j], x, y, z_0, z_1, look.images[j], detector, scale, look.inverse_square
-            )
+            _back_column_vector(column, at, line, (z_0, z_1), look, j, scale)
         else:
-            _back_column_plain(
-                column, at, look.P[j], x, y, z_0, z_1, look.images[j], detector, scale, look.inverse_square
-            )
+            _back_column_plain(column, at, line, (z_0, z_1), look, j, scale)
 
 
 @njit(cache=True, nogil=True, inline="always")

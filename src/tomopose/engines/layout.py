@@ -9,7 +9,7 @@ Indices.  No index is made from a number that was not first held, as a float, wi
 voxel column that is seen edge-on, or a ray along a face, divides by almost nothing, and int() of such a quotient is
 undefined.  NaN gives an empty range.
 
-numba's cache looks at a kernel's own file only: whoever changes this file or vector.py saves back_projection.py and
+numba's cache looks at a kernel's own file only: whoever changes this file or vector/ saves back_projection.py and
 forward_projection.py as well.
 """
 
