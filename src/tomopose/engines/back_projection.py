@@ -23,15 +23,15 @@ Line: TypeAlias = tuple[float, float, float, float, float, float]
 STEEP = 2.0**20
 """Pixels times w_max / w_min of a column's layers up to which a vector block is used.
 
-With eps = 2^-24 the float32 depth of a call's layers is off by 2 eps w_max at most, the numerator of u (counted from a
-pixel of the detector) by 2 eps n w_max, their quotient by 4 eps n w_max / w_min: a quarter of a pixel at the limit.  The
-border beyond the last seen place is one pixel wide.
+With eps = 2^-24 the float32 depth of a call's layers is off by 2 eps w_max at most, the numerator of u (counted from
+a pixel of the detector) by 2 eps n w_max, their quotient by 4 eps n w_max / w_min: a quarter of a pixel at the limit.
+The border beyond the last seen place is one pixel wide.
 """
 
 
 @njit(cache=True, nogil=True, inline="always")
 def column_image(P: np.ndarray, j: int, x: int, y: int) -> Line:
-    """a_u .. b_w: view j has layer z of column (x, y) at u = (a_u + b_u z) / w, v = (a_v + b_v z) / w, w = a_w + b_w z."""
+    """Column (x, y) in view j: layer z is at u = (a_u + b_u z) / w, v = (a_v + b_v z) / w, w = a_w + b_w z."""
     return (
         P[j, 0, 0] * x + P[j, 0, 1] * y + P[j, 0, 3],
         P[j, 0, 2],

@@ -40,7 +40,7 @@ BLOCKS = 16 if TWO_LOOPS else 1
 """Blocks of W voxels that a call takes; flat from 8 to 32 on benchmarks/reconstruction."""
 
 PLANES = 64
-"""Planes whose places are calculated together; flat from 64 to 128 on benchmarks/reconstruction, 16 are a third slower."""
+"""Planes whose places are calculated together; flat from 64 to 128 on benchmarks/reconstruction, with 16 slower."""
 
 AHEAD = 256
 """Voxels between a block and what is fetched meanwhile: about a column, the next one in memory."""
