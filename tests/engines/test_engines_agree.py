@@ -61,6 +61,23 @@ def test_back_projection_is_the_bilinear_look_up(kernels, weight, pitch, rng):
     assert not margin.any()  # a write beyond a column would spoil every later forward projection
 
 
+@pytest.mark.parametrize("weight", ["sum", "mean", "inverse-square"])
+def test_long_columns_and_deep_volumes_are_worked_on_piece_by_piece(weight, rng):
+    """150 layers and 90 planes: more than the kernels take at a time, and no multiple of it."""
+    grid = VoxelGrid(shape=(150, 90, 7), spacing=np.array([0.4, 0.12, 0.1]), centre=np.array([0.3, -0.2, 0.5]))
+    matrices, x = views(), rng.random(grid.shape)
+    images = rng.random((len(ANGLES), matrices.n_v, matrices.n_u))
+    every = list(range(len(ANGLES)))
+    reference, cpu = make_engine("reference", matrices, grid), make_engine("cpu", matrices, grid)
+    rays = reference.forward(reference.put(x), every)
+    assert scale_of(rays) > 5
+    assert np.abs(cpu.forward(cpu.put(x), every) - rays).max() < 5e-5 * scale_of(rays)
+    expected, found = reference.empty(), cpu.empty()
+    reference.back(images, every, into=expected, weight=weight)
+    cpu.back(images, every, into=found, weight=weight)
+    assert np.abs(cpu.values(found) - expected).max() < 2e-5 * scale_of(expected)
+
+
 @pytest.mark.parametrize("name", ["cpu", "reference"])
 def test_transpose_is_the_transpose(name, rng):
     matrices = views()
