@@ -137,6 +137,7 @@ from .manipulator.twin_file import TwinDrawing as TwinDrawing
 from .manipulator.twin_file import read_twin as read_twin
 from .measurement.alignment import Alignment as Alignment
 from .measurement.budget import Budget as Budget
+from .measurement.conformity import Decision as Decision
 from .measurement.features.feature import Feature as Feature
 from .measurement.measure import measure as measure
 from .measurement.mesh.mesh import Mesh as Mesh
@@ -153,7 +154,6 @@ from .measurement.plan import UncertaintyPlan as UncertaintyPlan
 from .measurement.plan import read_plan as read_plan
 from .measurement.probing import Probing as Probing
 from .measurement.probing import probe as probe
-from .measurement.result import Decision as Decision
 from .measurement.result import MeasurementResult as MeasurementResult
 from .measurement.result import Repeat as Repeat
 from .measurement.results import MeasurementResults as MeasurementResults

@@ -11,7 +11,8 @@ from scipy.stats import t
 
 from tomopose.coverage import combined, coverage_factor, expanded, expanded_k2
 from tomopose.measurement.budget import budget
-from tomopose.measurement.result import Decision, MeasurementResult, Repeat, decide
+from tomopose.measurement.conformity import Decision, decide
+from tomopose.measurement.result import MeasurementResult, Repeat
 from tomopose.measurement.results import MeasurementResults
 from tomopose.measurement.uncertainty import Simulated
 

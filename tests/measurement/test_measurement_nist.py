@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tomopose.measurement.features import fits
-from tomopose.measurement.nist import read_reference_pair, reference_pairs
+from tomopose.measurement.features.nist import read_reference_pair, reference_pairs
 
 LENGTH_MM, ANGLE_RAD = 1e-8, 1e-8
 NUMBER_OF_PAIRS = 12

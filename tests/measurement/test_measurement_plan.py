@@ -13,9 +13,9 @@ from scipy.special import ndtr
 from tomopose.errors import FileError, InputError, SchemaVersionError, UnitError
 from tomopose.geometry.rotations import exp_rotation, log_rotation
 from tomopose.measurement.alignment import datum, from_datums
+from tomopose.measurement.conformity import Decision
 from tomopose.measurement.measure import measure
 from tomopose.measurement.plan import plan_from, plan_schema, read_plan
-from tomopose.measurement.result import Decision
 from tomopose.measurement.results import write_results
 from tomopose.volume import VoxelGrid
 

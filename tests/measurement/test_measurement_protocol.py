@@ -17,11 +17,11 @@ from tomopose.errors import InputError
 from tomopose.io.volume_files import write_volume
 from tomopose.measurement.acceptance.protocol import acceptance_protocol
 from tomopose.measurement.alignment import Alignment
+from tomopose.measurement.conformity import Decision
 from tomopose.measurement.features.fits import fit_sphere
 from tomopose.measurement.measure import evaluate
 from tomopose.measurement.plan import plan_from
 from tomopose.measurement.probing import sphere_pattern
-from tomopose.measurement.result import Decision
 from tomopose.measurement.results import MeasurementResults
 from tomopose.volume import VoxelGrid
 

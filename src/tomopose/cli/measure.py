@@ -301,7 +301,7 @@ def told(
     out: Path, results: MeasurementResults, comparisons: Mapping[str, Comparison]
 ) -> tuple[dict[str, Any], list[str]]:
     """The summary for programs, and its lines for people."""
-    from tomopose.measurement.result import Decision
+    from tomopose.measurement.conformity import Decision
 
     beyond, open_ = results.decided(Decision.NOT_CONFORMING), results.decided(Decision.NOT_DECIDABLE)
     judged = len(beyond) + len(open_) + len(results.decided(Decision.CONFORMING))

@@ -17,8 +17,8 @@ from tomopose.errors import ConventionError, FileError, InputError, SchemaVersio
 from tomopose.exports.content import load
 from tomopose.exports.folder import FORMATS, MANIFEST
 from tomopose.exports.import_checks import require_millimetres, require_unmirrored, scaled_to_mm
-from tomopose.exports.kinds import READERS, Source, format_of
 from tomopose.exports.panel import Given, Rows
+from tomopose.exports.readers import READERS, Source, format_of
 from tomopose.exports.robot_json import is_robot_json
 from tomopose.files import natural_key, read_json
 from tomopose.geometry.projection import ProjectionMatrices

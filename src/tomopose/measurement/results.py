@@ -12,8 +12,9 @@ from typing import Any
 from tomopose.files import atomic_folder, write_json, write_text
 from tomopose.measurement.alignment import Alignment
 from tomopose.measurement.budget import Budget, budget, repeat_of
+from tomopose.measurement.conformity import Decision
 from tomopose.measurement.features.feature import Feature
-from tomopose.measurement.result import Decision, MeasurementResult, Repeat
+from tomopose.measurement.result import MeasurementResult, Repeat
 from tomopose.measurement.uncertainty import Simulated
 from tomopose.provenance import Provenance
 from tomopose.values import value

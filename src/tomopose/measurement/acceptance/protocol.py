@@ -34,9 +34,10 @@ from tomopose.coverage import expanded_k2
 from tomopose.errors import InputError
 from tomopose.files import atomic_folder, write_json, write_text
 from tomopose.measurement.bench import sphere_name
+from tomopose.measurement.conformity import Decision, decide
 from tomopose.measurement.features.measurands import maximum_permissible_error
 from tomopose.measurement.plan import LimitPlan, MeasurementPlan, SpheresPlan
-from tomopose.measurement.result import Decision, MeasurementResult, decide
+from tomopose.measurement.result import MeasurementResult
 from tomopose.measurement.results import MeasurementResults
 from tomopose.provenance import Provenance
 

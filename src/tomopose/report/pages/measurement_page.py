@@ -9,8 +9,9 @@ import numpy as np
 
 from tomopose.geometry.rotations import log_rotation
 from tomopose.measurement.budget import Budget
+from tomopose.measurement.conformity import Decision
 from tomopose.measurement.mesh.comparison import Comparison
-from tomopose.measurement.result import FIT_ALONE, Decision, MeasurementResult
+from tomopose.measurement.result import FIT_ALONE, MeasurementResult
 from tomopose.measurement.results import MeasurementResults
 from tomopose.report.figures.measurement_figures import (
     deviation_histogram,

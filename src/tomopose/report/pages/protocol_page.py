@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 from tomopose.measurement.acceptance.protocol import DEFINITIONS, GUIDELINE, Protocol, ProtocolLine
-from tomopose.measurement.result import Decision
+from tomopose.measurement.conformity import Decision
 from tomopose.report.page import BAD, CARE, GOOD, Block, Page, Section, Table, Verdict, Words, render
 from tomopose.report.sections.provenance import provenance_section
 from tomopose.units import MICROMETRES_PER_MM
