@@ -15,7 +15,7 @@ from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.measurement.mesh.mesh import Mesh
 from tomopose.measurement.plan import plan_from
 from tomopose.planning.part.part import Part
-from tomopose.planning.part.predict import _slopes, predicted
+from tomopose.planning.part.predict import _lengths, _slopes, predicted
 from tomopose.planning.part.sart_response import RELAXATION, sart_response
 from tomopose.planning.part.settings import PartSettings
 from tomopose.planning.part.targets import probed_targets
@@ -113,13 +113,28 @@ def test_the_prediction_and_the_reconstruction_relax_alike():
 def test_a_length_follows_the_edges_through_fit_and_lever():
     """Moving one end of the first plane tilts its normal, and the second plane's middle lies 10 mm beside it."""
     targets = probed_targets(plan(), 200)
-    slopes = _slopes(targets, plan())
+    slopes = _slopes(targets, plan(), _lengths(targets, plan()))
     top, bottom, ball = targets
     tilt = 1e-3 * (top.x[:, 0] + 5)
     assert slopes["height"]["top"] @ tilt == pytest.approx(1e-3 * 10, rel=1e-6)
     assert slopes["height"]["top"] @ np.full(len(top.x), 1e-3) == pytest.approx(1e-3, rel=1e-6)
     assert slopes["height"]["bottom"] @ np.full(len(bottom.x), 1e-3) == pytest.approx(1e-3, rel=1e-6)
     assert slopes["D"]["ball"] @ np.full(len(ball.x), 1e-3) == pytest.approx(2e-3, rel=1e-6)
+
+
+def test_a_distance_without_a_rule_is_left_to_the_measurement():
+    """A cone and a plane have no distance; a circle and a plane have one."""
+    cone = {"kind": "cone", "point": [0, 0, 0], "direction": [0, 0, 1], "radius_mm": 3, "length_mm": 4}
+    circle = {"kind": "circle", "point": [0, 0, 1], "direction": [0, 0, 1], "radius_mm": 3.0}
+    rows = [{"name": f"top to {k}", "kind": "distance", "of": ["top", k]} for k in ("cone", "circle")]
+    given = {"top": FEATURES["top"], "cone": {**cone, "half_angle_deg": 10}, "circle": circle}
+    document = {"schema": "tomopose/measurement-plan/1", "unit": "mm", "features": given, "measurands": rows}
+    asked = plan_from(document)
+    targets = probed_targets(asked, 60)
+    wanted = _lengths(targets, asked)
+    assert [m.name for m in wanted] == ["top to circle"]
+    top = _slopes(targets, asked, wanted)["top to circle"]["top"]
+    assert top @ np.full(len(targets[0].x), 1e-3) == pytest.approx(1e-3, rel=1e-6)
 
 
 def test_four_times_the_quanta_halve_the_uncertainty():

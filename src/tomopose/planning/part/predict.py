@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_array, hstack, vstack
 
+from tomopose.errors import InputError
 from tomopose.geometry.scanner import Scanner
 from tomopose.measurement.alignment import Alignment
 from tomopose.measurement.features.feature import Feature
@@ -39,6 +40,7 @@ SINGLE_POINTS = 24
 STEP = 1e-4
 """mm and rad, of the differences that lengths are derived by."""
 PREDICTED = ("distance", "diameter")
+NOWHERE = Alignment(R=np.eye(3), t=np.zeros(3), rule="given")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,8 +88,8 @@ def predicted(
             )
         )
     by = dict(zip((t.name for t in goal.targets), own, strict=True))
-    for m in _lengths(plan):
-        if m.kind == "distance":
+    for m in () if plan is None else plan.measurands:
+        if m.kind == "distance" and m.name in lengths:
             lengths[m.name] = float(np.linalg.norm([lengths[m.name], *(by[f] for f in m.of)]))
     return out, lengths
 
@@ -96,10 +98,10 @@ def _from_noise(
     goal: Goal, scanner: Scanner, P: Array, plan: MeasurementPlan | None
 ) -> tuple[Array, Array, dict[str, float]]:
     """(u of the place, u of the radius) (targets,) and of the lengths, mm, from the noise alone."""
-    wanted = _lengths(plan)
     if plan is not None and plan.features:
         goal = replace(goal, targets=probed_targets(plan, PROBED))
     targets = goal.targets
+    wanted = () if plan is None else _lengths(targets, plan)
     depth = goal.part.hull @ P[:, 2, :3].T + P[:, 2, 3]
     if not (depth > 0).all():
         nothing = np.full(len(targets), np.inf)
@@ -109,7 +111,7 @@ def _from_noise(
     rows: list[csr_array] = []
     for target in targets:
         rows += [_spread(edges, {target.name: w}) for w in (*_place_rows(target), *_size_rows(target))]
-    slopes = {} if plan is None else _slopes(targets, plan)
+    slopes = {} if plan is None else _slopes(targets, plan, wanted)
     rows += [_spread(edges, slopes[m.name]) for m in wanted]
     x = np.concatenate([e.x.reshape(-1, 3) for e in edges.values()])
     C = response.covariance(x, csr_array(vstack(rows)))
@@ -193,38 +195,41 @@ def _vector_rows(target: Target) -> tuple[Array, Array]:
     return vector, D
 
 
-def _lengths(plan: MeasurementPlan | None) -> tuple[MeasurandPlan, ...]:
-    """The measurands that are predicted: distances and diameters of least-squares features."""
-    if plan is None:
-        return ()
-    return tuple(
-        m
-        for m in plan.measurands
-        if m.kind in PREDICTED
-        and m.reference is None
-        and all(f in plan.features and plan.features[f].reference == "least-squares" for f in m.of)
-    )
+def _values(targets: tuple[Target, ...], plan: MeasurementPlan, moved: Mapping[str, Array]) -> list[float]:
+    """Of the plan's measurands, with the vectors of some features moved."""
+    at = {t.name: _feature(t, moved.get(t.name, _vector_rows(t)[0])) for t in targets}
+    return [r.value for r in evaluate(plan, at, NOWHERE)]
 
 
-def _slopes(targets: tuple[Target, ...], plan: MeasurementPlan) -> dict[str, dict[str, Array]]:
+def _lengths(targets: tuple[Target, ...], plan: MeasurementPlan) -> tuple[MeasurandPlan, ...]:
+    """The measurands that are predicted: distances and diameters of least-squares features that have a rule."""
+    out = []
+    for m in plan.measurands:
+        known = all(f in plan.features and plan.features[f].reference == "least-squares" for f in m.of)
+        if m.kind not in PREDICTED or m.reference is not None or not known:
+            continue
+        try:
+            _values(targets, plan.model_copy(update={"measurands": (m,), "spheres": None}), {})
+        except InputError:  # the measurement will say so
+            continue
+        out.append(m)
+    return tuple(out)
+
+
+def _slopes(
+    targets: tuple[Target, ...], plan: MeasurementPlan, wanted: tuple[MeasurandPlan, ...]
+) -> dict[str, dict[str, Array]]:
     """Length -> target -> (m,) derivative of the length by each point's edge, by central differences."""
-    wanted = _lengths(plan)
-    bare = plan.model_copy(update={"measurands": wanted, "spheres": None})
-    nowhere = Alignment(R=np.eye(3), t=np.zeros(3), rule="given")
     ways = {t.name: _vector_rows(t) for t in targets}
-    features = {t.name: _feature(t, ways[t.name][0]) for t in targets}
     out: dict[str, dict[str, Array]] = {m.name: {} for m in wanted}
-    for name in {f for m in wanted for f in m.of}:
-        vector, D = ways[name]
-        for k in np.flatnonzero(D.any(axis=1)):
-            ends = []
-            for side in (1, -1):
-                moved = vector + side * STEP * np.eye(8)[k]
-                ends.append(evaluate(bare, {**features, name: replace(features[name], vector=moved)}, nowhere))
-            for above, below in zip(*ends, strict=True):
-                slope = (above.value - below.value) / (2 * STEP)
-                if slope:
-                    out[above.name][name] = out[above.name].get(name, np.zeros(D.shape[1])) + slope * D[k]
+    for name, (vector, D) in ways.items():
+        of_it = tuple(m for m in wanted if name in m.of)
+        bare = plan.model_copy(update={"measurands": of_it, "spheres": None})
+        for k in np.flatnonzero(D.any(axis=1)) if of_it else ():
+            above, below = (_values(targets, bare, {name: vector + h * np.eye(8)[k]}) for h in (STEP, -STEP))
+            for m, high, low in zip(of_it, above, below, strict=True):
+                slope = (high - low) / (2 * STEP) * D[k]
+                out[m.name][name] = out[m.name].get(name, np.zeros(D.shape[1])) + slope
     return out
 
 
