@@ -43,8 +43,8 @@ from tomopose.units import Array
 
 RELAXATION = 0.8
 """Of `reconstruct` with sart unless another is asked for."""
-MOST_PIXELS = 192
-"""Of the part's image along a side; a finer panel is taken in blocks."""
+MOST_PIXELS = 160
+"""Square root of the pixels of the part's image; a finer panel is taken in blocks."""
 MARGIN = 12
 """Pixels about the part's image that are filtered with it."""
 CELLS = 2
@@ -94,9 +94,10 @@ class SartResponse:
 def sart_response(part: Part, scanner: Scanner, P: Array, settings: PartSettings) -> SartResponse:
     """Of views with matrices P (n, 3, 4), part at home -> pixels.  What leaves the panel is taken as if it did not."""
     x_D = project(P, part.hull)
-    block = max(math.ceil(float(np.ptp(x_D, axis=1).max()) / MOST_PIXELS), 1)
+    size = np.ptp(x_D, axis=1).max(axis=0)
+    block = max(math.ceil(math.sqrt(float(size.prod())) / MOST_PIXELS), 1)
     low = np.floor((x_D.min(axis=1) - (block - 1) / 2) / block) - MARGIN
-    n_u, n_v = (int(k) for k in np.ceil(np.ptp(x_D, axis=1).max(axis=0) / block) + 2 * MARGIN + 2)
+    n_u, n_v = (int(k) for k in np.ceil(size / block) + 2 * MARGIN + 2)
     crop = np.zeros((len(P), 3, 3))
     crop[:, 0, 0] = crop[:, 1, 1] = 1 / block
     crop[:, :2, 2] = -(block - 1) / 2 / block - low

@@ -13,7 +13,7 @@ from tomopose.planning.part_scan.choose import without_each
 from tomopose.planning.part_scan.stations import Machine, allowed
 from tomopose.units import Array
 
-ROUNDS = 3
+ROUNDS = 2
 """Each halves the steps of the one before."""
 LIFT_STEP_MM = 2.0
 
