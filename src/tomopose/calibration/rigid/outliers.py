@@ -76,7 +76,7 @@ def studentised(problem: Problem, fit: Fit, keep: npt.NDArray[np.bool_], x_calc:
     a, b, c = V[:, 0, 0], V[:, 0, 1], V[:, 1, 1]
     det = a * c - b * b
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = (c * y_0 * y_0 - 2.0 * b * y_0 * y_1 + a * y_1 * y_1) / det
+        found: Array = (c * y_0 * y_0 - 2.0 * b * y_0 * y_1 + a * y_1 * y_1) / det
     # a row that the fit follows entirely has no residual of its own: floor at one per cent of its covariance
     low = np.flatnonzero(~((a > LEAST_SHARE) & ((a - LEAST_SHARE) * (c - LEAST_SHARE) > b * b)))
     if len(low):
