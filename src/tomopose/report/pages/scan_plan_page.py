@@ -259,9 +259,9 @@ def _features(document: ScanPlanFigures) -> Table:
     return Table(
         title="Features",
         meaning=(
-            "Share of the feature that is seen, and the standard uncertainty of its position that the views' noise lets "
-            "expect after SART and the fit. Systematic deviations (few views, cone beam, beam hardening, scatter) are not "
-            "in it."
+            "Share of the feature that is seen, and the standard uncertainty of its position that the views' noise "
+            "lets expect after SART and the fit. Systematic deviations (few views, cone beam, beam hardening, "
+            "scatter) are not in it."
         ),
         columns=["feature", *(name for name, _ in paths)],
         rows=rows,
