@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import random
 import re
@@ -120,17 +121,17 @@ def value(data: bytearray, rng: random.Random) -> None:
     """Another kind of value somewhere in a JSON document."""
     try:
         document = json.loads(bytes(data))
-    except ValueError:
+    except (ValueError, RecursionError):  # the second change of a document that the first nested deeply
         return number(data, rng)
     places: list[tuple[object, object]] = []
-
-    def collect(node: object) -> None:
-        pairs = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
-        for key, inner in pairs:
-            places.append((node, key))
-            collect(inner)
-
-    collect(document)
+    nodes: list[object] = [document]
+    while nodes:
+        node = nodes.pop()
+        pairs = (
+            list(node.items()) if isinstance(node, dict) else list(enumerate(node)) if isinstance(node, list) else []
+        )
+        places += [(node, key) for key, _ in pairs]
+        nodes += [inner for _, inner in pairs]
     if not places:
         return flip(data, rng)
     node, key = rng.choice(places)
@@ -143,7 +144,8 @@ def value(data: bytearray, rng: random.Random) -> None:
         node["unknown"] = node[key]
     else:
         node[key] = rng.choice(VALUES)  # type: ignore[index]
-    data[:] = json.dumps(document).encode()
+    with contextlib.suppress(RecursionError):
+        data[:] = json.dumps(document).encode()
     return None
 
 
