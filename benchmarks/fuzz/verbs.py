@@ -53,7 +53,8 @@ of = ["ball"]
 TIMES = re.compile(
     rb"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d[^\"<\s]*|[A-Z][a-z]{2} [A-Z][a-z]{2} [ \d]\d \d\d:\d\d:\d\d \d{4}"
 )
-CHANGING = ("provenance", "digest", "content_sha256", "utc", "created", "manifest")
+TAKEN = ("seconds", "processor_seconds", "compile_seconds")
+CHANGING = ("provenance", "digest", "content_sha256", "utc", "created", "manifest", *TAKEN)
 
 
 def prepare(folder: Path) -> None:
