@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import copy
+import hashlib
 import io
 import math
+import multiprocessing
 import re
 import sys
 import tempfile
@@ -20,9 +21,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import ctsimu.geometry as geometry_module
 import numpy as np
 from ctsimu.evaluation import test2D_HS_1
 from ctsimu.geometry import Geometry
+from ctsimu.image import Image
 from ctsimu.primitives import Vector
 from ctsimu.toolbox import Toolbox
 from images import opaque, run_of, scenario, wedge_run, wedge_scanner, write, write_drawn
@@ -74,16 +77,47 @@ def plain_numbers() -> Iterator[None]:
         Vector.distance, Vector.angle, test2D_HS_1.list_mean_and_stddev = distance, angle, mean
 
 
-@contextlib.contextmanager
-def one_analytical_image() -> Iterator[None]:
-    """2D-WE-2 calculates its analytical image anew for every run, pixel by pixel; meanwhile it is kept."""
-    calculate = Geometry.create_detector_flat_field_sphere
-    kept: list[tuple[object, ...]] = []
+def columns_of_analytical_image(geometry: Geometry, polygons: list[object], columns: range) -> list[np.ndarray]:
+    """Those columns of the toolbox's two images, by its own function, whose loop over columns is shortened."""
+    width, begun = geometry.detector.cols(), False
 
-    def once(self: Geometry, *polygons: object) -> tuple[object, ...]:
-        if not kept:
-            kept.append(calculate(self, *polygons))
-        return copy.deepcopy(kept[0])
+    def shortened(*n: int) -> range:
+        nonlocal begun
+        first, begun = not begun and n == (width,), begun or n == (width,)
+        return columns if first else range(*n)
+
+    geometry_module.range = shortened
+    try:
+        return [image.px for image in geometry.create_detector_flat_field_sphere(*polygons)]
+    finally:
+        del geometry_module.range
+
+
+@contextlib.contextmanager
+def analytical_image_once(folder: Path, threads: int) -> Iterator[None]:
+    """2D-WE-1 and 2D-WE-2 calculate an analytical image pixel by pixel, for 20 minutes: its columns are shared among
+    processes, and it is kept beside the tests' images for the next run with the same detector and edge."""
+    calculate = Geometry.create_detector_flat_field_sphere
+
+    def once(self: Geometry, *polygons: object) -> tuple[Image, ...]:
+        setting = repr(
+            (str(self.detector), str(self.source), [[str(p) for p in polygon.points] for polygon in polygons])
+        )
+        kept = folder / f"analytical_{hashlib.sha256(setting.encode()).hexdigest()[:16]}.npy"
+        if not kept.exists():
+            bands = [range(x, min(x + 16, self.detector.cols())) for x in range(0, self.detector.cols(), 16)]
+            Geometry.create_detector_flat_field_sphere = calculate
+            with multiprocessing.get_context("fork").Pool(threads) as pool:
+                parts = pool.starmap(columns_of_analytical_image, [(self, list(polygons), band) for band in bands], 1)
+            Geometry.create_detector_flat_field_sphere = once
+            np.save(kept, np.sum(parts, axis=0))
+        images = []
+        for px in np.load(kept):
+            image = Image()
+            image.shape(self.detector.cols(), self.detector.rows(), 0, image.getInternalDataType())
+            image.px[:] = px
+            images.append(image)
+        return tuple(images)
 
     Geometry.create_detector_flat_field_sphere = once
     try:
@@ -203,7 +237,8 @@ def focal_spot(place: Place) -> list[Row]:
     for key, (k, _, _) in SPOTS.items():
         content = opaque(scenario(f"2D-WE-1_Spot{k}_2021-10-13v02r04dp.json"))
         files[key] = write(place.folder, key, run_of(content, place.folder, half_plane_edge()), threads=place.threads)
-    place.evaluate("2D-WE-1", **files)
+    with analytical_image_once(place.folder, place.threads):
+        place.evaluate("2D-WE-1", **files)
     for key, (_, sigma, mtf20) in SPOTS.items():
         text = place.result("2D-WE-1", f"2D-WE-1_{key}_summary.txt")
         own = 1000 * number(text.split("measured:   sigma")[1], "[mm] =")
@@ -225,7 +260,7 @@ def partial_pixels(place: Place) -> list[Row]:
     # the x that it has already turned.
     c, s = math.cos(math.radians(3)), math.sin(math.radians(3))
     edges = (("3 degrees", math.radians(3), None), ("as the toolbox turns", math.atan(s / (c - s * s)), math.atan(s)))
-    with one_analytical_image():
+    with analytical_image_once(place.folder, place.threads):
         for name, right, top in edges:
             run = run_of(opaque(scenario(EDGE)), place.folder, half_plane_edge(right, top), moved=True)
             place.evaluate("2D-WE-2", write(place.folder, "edge", run, threads=place.threads))
