@@ -34,9 +34,9 @@ from typing import Any
 import numpy as np
 
 from tomopose.coverage import combined, expanded
+from tomopose.measurement.conformity import Decision
 from tomopose.measurement.result import (
     FIT_ALONE,
-    Decision,
     MeasurementResult,
     Repeat,
     decided,

@@ -108,7 +108,7 @@ def trajectory_sigma(
     """
     x_M = plate_points(calibration, points)
     J, C = scan_jacobian(calibration, poses, x_M)
-    V = np.einsum("nmic,cd,nmid->nmi", J, C, J, optimize=True)
+    V: Array = np.einsum("nmic,cd,nmid->nmi", J, C, J, optimize=True)
     if scatter:
         V = V + scatter_variance(calibration, correction(calibration.errors, poses).poses, x_M)
-    return np.sqrt(np.maximum(V, 0.0))
+    return np.asarray(np.sqrt(np.maximum(V, 0.0)))
