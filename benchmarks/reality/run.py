@@ -20,10 +20,15 @@ from bends import BENDS, Bend, Data
 from chain import World, intrinsic_xyz
 
 import tomopose as tp
+from tomopose.calibration.rigid.pose_noise import scatter_prior
+from tomopose.manipulator.real_poses import Repeatability
 
 NOISE = 0.0146
-PLATFORM_SCALE, ROBOT_SCALE = 5e-5, 1e-3
-"""Documented defaults for the scale of a manipulator's translations, where nothing is stated of the scanner."""
+PLATFORM_SCALE, ROBOT_SCALE, PLATFORM_ROTATION_SCALE = 5e-5, 1e-3, 1.3e-4
+"""Documented defaults for the scale of a manipulator's translations and of a platform's rotations, where nothing is
+stated of the scanner."""
+AXIS_MM, AXIS_RAD = 0.02, 2e-4
+"""Documented defaults for where the table's axis is."""
 FLOOR = 0.002
 """px: below it a true error is noise of the benchmark, whatever its ratio to the stated one."""
 ASSUMED = ("uncertainty with all that is assumed", "uncertainty that nobody stated")
@@ -91,7 +96,10 @@ def plan_of(name: str, where: str, rng: np.random.Generator) -> plans.Poses:
 
 
 def one(plan: str, where: str, bend: Bend | None, seed: int, *, sigma: dict[str, float], draw: bool = False) -> Outcome:
-    """One calibration: a world, bent; data; what the library says; what is true.  draw: scanner errors from SIZES."""
+    """One calibration: a world, bent; data; what the library says; what is true.
+
+    draw: everything that a calibration assumes is drawn.
+    """
     rng = np.random.default_rng([seed, zlib.crc32(f"{plan}{where}{bend and bend.name}{bend and bend.size}".encode())])
     world, balls = plans.world(where, rng)
     scanner = declared(world, sigma)
@@ -101,8 +109,14 @@ def one(plan: str, where: str, bend: Bend | None, seed: int, *, sigma: dict[str,
         sizes = {k: s for k, s in assumed_sizes(scanner).items() if where != "moving" or k not in ("d_SR", "eta")}
         for key, s in sizes.items():
             setattr(world.panel, key, getattr(world.panel, key) + s * rng.standard_normal())
+        if where != "moving":
+            world.table.offset = np.array([0.0, AXIS_MM * rng.standard_normal(), 0.0])
+            world.table.lean = tuple(AXIS_RAD * rng.standard_normal(2))
         scale = ROBOT_SCALE if where in ("robot", "moving") else PLATFORM_SCALE
         world.machine.scale_t = 1.0 + scale * rng.standard_normal() * np.ones(3)
+        if where not in ("robot", "moving"):
+            world.machine.scale_w = 1.0 + PLATFORM_ROTATION_SCALE * rng.standard_normal(3)
+        world.machine.scatter = drawn_scatter(rng)
     if bend and bend.world:
         bend.world(world, rng, len(poses))
     x = world.image(poses.w, poses.t, poses.alpha, balls[poses.ball][:, None], rng, run=True)[:, 0]
@@ -164,6 +178,15 @@ def one(plan: str, where: str, bend: Bend | None, seed: int, *, sigma: dict[str,
         ms,
         shift,
     )
+
+
+def drawn_scatter(rng: np.random.Generator) -> tuple[float, float]:
+    """Scatter of the poses, mm and rad, from the prior that a calibration assumes of a platform."""
+    q = np.geomspace(1e-4, 10.0, 4000)
+    share = np.cumsum(scatter_prior(q) * np.gradient(q))
+    maker = Repeatability()
+    t, w = np.interp(rng.random(2) * share[-1], share, q)
+    return float(t * maker.t_mm), float(w * maker.w_rad)
 
 
 def assumed_sizes(scanner: tp.Scanner) -> dict[str, float]:
