@@ -31,8 +31,8 @@ AXIS_MM, AXIS_RAD = 0.02, 2e-4
 """Documented defaults for where the table's axis is."""
 FLOOR = 0.002
 """px: below it a true error is noise of the benchmark, whatever its ratio to the stated one."""
-ASSUMED = ("uncertainty with all that is assumed", "uncertainty that nobody stated")
-"""Rules that say how uncertain a scan is by what was assumed."""
+ASSUMED = "uncertainty with all that is assumed"
+"""Rule: the uncertainty of a scan, with what was assumed, is above a pixel."""
 ARRANGEMENTS = ("hexapod", "two balls", "robot", "moving")
 SIZES = {
     "d_SD": 0.5,
@@ -208,7 +208,7 @@ def _calibrate(where, scanner, logged, observed, known):
         return None, str(error)
     explained = [e.words for e in cal.explanations]
     # how uncertain the assumed values make a scan is said of every run alike, and names no culprit
-    checks = [f for f in cal.checks if f.rule not in ("degrees of freedom", *ASSUMED)]
+    checks = [f for f in cal.checks if f.rule not in ("degrees of freedom", ASSUMED)]
     reasons = [f.words for f in checks if f.verdict != "trustworthy"]
     return cal, [*explained, *reasons, *(f.words for f in checks if f.verdict == "trustworthy")]
 

@@ -268,22 +268,6 @@ def test_a_platform_of_which_nothing_is_stated_has_the_scales_of_one_as_delivere
     assert measured["rotation_scale_x"] < 0.2 * delivered["rotation_scale_x"]
 
 
-def test_a_scanner_that_nobody_stated_and_no_image_shows_is_not_trusted():
-    poses = paper_poses()
-    silent = tp.calibrate(SILENT, poses, observe(poses))
-    assert silent.verdict == "doubtful"
-    finding = next(f for f in silent.checks if f.rule == "uncertainty that nobody stated")
-    assert 0.5 < finding.value <= silent.budget.total
-    assert "second angle" in finding.remedy
-    # the same numbers in the user's own words
-    stated = replace(
-        SILENT, sigma={a.name: a.sigma for a in silent.assumed if a.source == "default" and a.value is not None}
-    )
-    known = tp.calibrate(stated, poses, observe(poses))
-    assert known.verdict == "trustworthy"
-    assert known.budget.total == pytest.approx(silent.budget.total, rel=0.02)
-
-
 def test_halves_of_the_poses_differ_by_what_is_stated_and_by_more_where_the_model_is_wrong():
     poses = mixed_poses(n=120)
     clean = [tp.calibrate(SILENT, poses, observe(poses, seed=k), hypotheses=False).halves for k in range(6)]

@@ -187,7 +187,6 @@ def met(name: str, e: Evidence) -> Mapping[str, Any]:
         "repeated pose, set aside": {"stability": repeat(e), "outliers": ("188",)},
         "held-out poses": {"stability": replace(e.stability, held_out_rms=0.09, held_out_chi2=20.0)},
         "uncertainty of a tilted scan": {"scan_px": 0.3},
-        "uncertainty that nobody stated": {"unstated_px": 0.6},
         "uncertainty with all that is assumed": {"stated_px": 1.1, "stated_words": "1.1 px, of which 0.7 px from eta"},
         "scatter of the poses": {"scatter": ScatterFound(ratio=16.0, t_mm=5e-4, w_rad=1.2e-5)},
         "no better than trusted poses": {"against_rigid": AgainstRigid(chosen_px=0.03, rigid_px=0.02, better=False)},

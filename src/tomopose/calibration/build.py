@@ -20,7 +20,7 @@ from tomopose.calibration.checks.rules import findings
 from tomopose.calibration.checks.score_tests.scanner_tests import ScannerTests
 from tomopose.calibration.checks.stability import stability
 from tomopose.calibration.model.assumed import Assumed
-from tomopose.calibration.model.budget import budget_words, unstated_px
+from tomopose.calibration.model.budget import budget_words
 from tomopose.calibration.model.covariance import angles_by_tangent
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, unit_of
@@ -196,7 +196,6 @@ def evidence_of(f: Fitted, result: Calibration) -> Evidence:
         scan_px=None if result.budget is None else result.budget.measured,
         stated_px=None if result.budget is None else result.budget.total,
         stated_words="" if result.budget is None else budget_words(result.budget, result.assumed),
-        unstated_px=None if result.budget is None else unstated_px(result.budget, result.assumed),
         tests=f.tests,
         contradicted=f.contradicted,
         undistinguished=f.undistinguished,

@@ -297,15 +297,6 @@ RULES: tuple[Rule, ...] = (
         arrangements=("moving-object", "moving-scanner"),
     ),
     Rule(
-        name="uncertainty that nobody stated",
-        condition="scanner values with a default, which nobody stated, carry more than {limit:g} px of it",
-        limit=0.5,
-        verdict="doubtful",
-        reason="half of the pixel above: a default is known to a factor of two at best",
-        measure=measures.unstated_scan,
-        arrangements=("moving-object", "moving-scanner"),
-    ),
-    Rule(
         name="scatter of the poses",
         condition="the poses scatter with {limit:g} times the variance of the stated repeatability",
         limit=9.0,

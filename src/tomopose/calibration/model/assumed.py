@@ -64,7 +64,7 @@ states another, and fixing it says that it is exact.
 
 Who states a standard deviation of every value of the scanner (0 where it is exact) has measured the set-up, and has the
 first of the numbers; who leaves one to its default has a platform as it was delivered.  This condition and the 0.01 mm
-were tuned on benchmarks/reality: the worst error of a trustworthy run fell from 8.1 to 4.4 stated sigmas."""
+were tuned on benchmarks/reality."""
 
 WOBBLE_MM, WOBBLE_RAD = 3e-5, 0.25e-6
 """Radial, axial and tilt error motion of a rotary table with an air bearing, first harmonic."""

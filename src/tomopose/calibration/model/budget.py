@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from tomopose.calibration.model.assumed import Assumed
@@ -46,12 +45,6 @@ class Halves:
     rms_px: float
     stated_px: float
     p: float
-
-
-def unstated_px(budget: ScanBudget, assumed: tuple[Assumed, ...]) -> float:
-    """px: what the scanner values with a default, which nobody stated, carry together."""
-    default = {a.name for a in assumed if a.source == "default"}
-    return min(math.sqrt(sum(px**2 for name, px in budget.shares if name in default)), budget.total)
 
 
 def budget_words(budget: ScanBudget, assumed: tuple[Assumed, ...]) -> str:

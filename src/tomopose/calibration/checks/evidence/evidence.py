@@ -77,7 +77,6 @@ class Evidence:
     residual_px, expected_px: d_rms, and what the stated sigmas explain of it;  spread_px: rms spread of the centres.
     scan_px:      predicted standard uncertainty of a scan tilted by 5 degrees, px, were everything assumed exact.
     stated_px:    the same with everything assumed;  stated_words: the sentence that names its parts.
-    unstated_px:  what scanner values that nobody stated carry of it.
     diagnosis:    alternative conventions, fitted by the model that trusts the poses.
     size:         identified errors over what the machine's file states.
     run_effects:  drift and lag of the run are among the parameters.
@@ -106,7 +105,6 @@ class Evidence:
     scan_px: float | None = None
     stated_px: float | None = None
     stated_words: str = ""
-    unstated_px: float | None = None
     diagnosis: Diagnosis | None = None
     stability: Stability | None = None
     scatter: ScatterFound | None = None

@@ -272,17 +272,6 @@ def whole_scan(e: Evidence, limit: float) -> Iterator[Found]:
         )
 
 
-def unstated_scan(e: Evidence, limit: float) -> Iterator[Found]:
-    """Scanner values of which nobody stated anything, and of which the images show nothing either."""
-    if e.unstated_px is not None and _above(e.unstated_px, limit):
-        yield Found(
-            value=e.unstated_px,
-            words=f"scanner values that nobody stated carry {e.unstated_px:.2g} px of a tilted scan's uncertainty, and "
-            "these poses do not show them: a default may be too small by a factor of two",
-            remedy="turn the table to a second angle, or state what you know (sigma in scanner.json, 0: exact; --fix)",
-        )
-
-
 def scatter(e: Evidence, limit: float) -> Iterator[Found]:
     s = e.scatter
     if s is not None and _above(s.ratio, limit):
