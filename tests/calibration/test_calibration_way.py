@@ -37,7 +37,7 @@ def _calls(calibration: tp.Calibration, poses: tp.PoseSequence) -> list[tuple[tu
             return
         names = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
         content = tuple(_content(frame.f_locals.get(name)) for name in names)
-        seen.append(((code.co_filename.split("/tomopose/")[1], code.co_name), content))
+        seen.append(((code.co_filename.rsplit("/tomopose/", 1)[1], code.co_name), content))
 
     sys.setprofile(note)
     try:

@@ -53,25 +53,26 @@ def _votes(image, square, threshold, radii, out):  # type: ignore[no-untyped-def
     radii: (bands, 2), the first and the last of each band that an edge votes for.
     """
     rows, columns = image.shape
-    for j in range(1, rows - 1):
-        for i in range(1, columns - 1):
-            here = square[j, i]
-            if not here > threshold:
-                continue
-            gu = image[j, i + 1] - image[j, i - 1]
-            gv = image[j + 1, i] - image[j - 1, i]
-            length = math.sqrt(here)
-            gu, gv = gu / length, gv / length
-            du, dv = round(gu), round(gv)
-            if square[j + dv, i + du] > here or square[j - dv, i - du] >= here:
-                continue
-            for polarity in range(2):
-                sign = -1.0 if polarity == 0 else 1.0
-                for band in range(radii.shape[0]):
-                    for radius in range(radii[band, 0], radii[band, 1] + 1):
-                        x, y = round(i + radius * (sign * gu)), round(j + radius * (sign * gv))
-                        if 0 <= x < columns and 0 <= y < rows:
-                            out[polarity, band, y, x] += 1.0 / (2.0 * math.pi * radius)
+    inner, bands = columns - 2, radii.shape[0]
+    for p in range((rows - 2) * inner):
+        j, i = p // inner + 1, p % inner + 1
+        here = square[j, i]
+        if not here > threshold:
+            continue
+        gu = image[j, i + 1] - image[j, i - 1]
+        gv = image[j + 1, i] - image[j - 1, i]
+        length = math.sqrt(here)
+        gu, gv = gu / length, gv / length
+        du, dv = round(gu), round(gv)
+        if square[j + dv, i + du] > here or square[j - dv, i - du] >= here:
+            continue
+        for k in range(2 * bands):
+            polarity, band = k // bands, k % bands
+            sign = -1.0 if polarity == 0 else 1.0
+            for radius in range(radii[band, 0], radii[band, 1] + 1):
+                x, y = round(i + radius * (sign * gu)), round(j + radius * (sign * gv))
+                if 0 <= x < columns and 0 <= y < rows:
+                    out[polarity, band, y, x] += 1.0 / (2.0 * math.pi * radius)
 
 
 @njit(cache=True)
@@ -84,10 +85,11 @@ def _maxima(votes, reach, least, total, out):  # type: ignore[no-untyped-def]
     rows, columns = votes.shape
     for j in range(rows):
         for i in range(columns):
-            if votes[j, i] != 0.0:
-                for y in range(max(0, j - reach), min(rows, j + reach + 1)):
-                    for x in range(max(0, i - reach), min(columns, i + reach + 1)):
-                        total[y, x] += votes[j, i]
+            if votes[j, i] == 0.0:
+                continue
+            for y in range(max(0, j - reach), min(rows, j + reach + 1)):
+                for x in range(max(0, i - reach), min(columns, i + reach + 1)):
+                    total[y, x] += votes[j, i]
     n = 0
     for j in range(rows):
         for i in range(columns):

@@ -161,9 +161,8 @@ def fill_smooth(
             if rough[j, i]:
                 continue
             if seen[j, i] == 0:
-                for a in range(f):
-                    for b in range(f):
-                        out[0, j * f + a, i * f + b] += weight
+                for a in range(f * f):
+                    out[0, j * f + a // f, i * f + a % f] += weight
                 continue
             f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
             I_uu = 0.25 * (I[j, i - 1] - f_00 - f_01 + I[j, i + 2] + I[j + 1, i - 1] - f_10 - f_11 + I[j + 1, i + 2])

@@ -174,10 +174,9 @@ def corners(
                 I[j, i], seen[j, i] = at(c, work, u_0 + step * i - 0.5, v_0 + step * j - 0.5)
                 if seen[j, i] < 0:
                     fine = False
-                if step > 1:
-                    met = 0
-                    for k in range(len(work.active)):
-                        met += work.active[k]
-                    if met != work.S[-1, -1]:
-                        seen[j, i] = 0
+                met = 0
+                for k in range(len(work.active)):
+                    met += work.active[k]
+                if step > 1 and met != work.S[-1, -1]:
+                    seen[j, i] = 0
     return fine
