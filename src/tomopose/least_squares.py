@@ -111,7 +111,7 @@ def least_squares(
                 r, J = rows(state)
                 cost = _sum_of_squares(r)
         else:
-            short = short or _unseen(J, r, cost)
+            short = short or promised(J, r) <= UNSEEN * cost
             damping = max(damping * 10, FIRST_DAMPING)
         if short:
             return ended(Status.CONVERGED)
@@ -126,10 +126,10 @@ def _sum_of_squares(r: Array) -> float:
     return cost if np.isfinite(cost) else np.inf
 
 
-def _unseen(J: Array, r: Array, cost: float) -> bool:
-    """Whether the undamped step promises less than what rounding hides."""
+def promised(J: Array, r: Array) -> float:
+    """What the sum of squares would still fall by, were the problem linear; infinite where a direction is open."""
     whole = _step(J, r, 0.0)
-    return whole is not None and float(np.sum((J @ whole) ** 2)) <= UNSEEN * cost
+    return np.inf if whole is None else float(np.sum((J @ whole) ** 2))
 
 
 def _step(J: Array, r: Array, damping: float) -> Array | None:

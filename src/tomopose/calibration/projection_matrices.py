@@ -111,7 +111,7 @@ def projection_matrices(
     x_M = (x_W - seen_at[:3, 3]) @ seen_at[:3, :3]
     J, C = scan_jacobian(calibration, poses, x_M)
     # both are what a volume sees: a rigid pose of the object, on which no measurement depends, is taken out
-    shared = np.mean(np.einsum("nmic,cd,nmid->nmi", J, C, J, optimize=True), axis=2)
+    shared = np.maximum(np.mean(np.einsum("nmic,cd,nmid->nmi", J, C, J, optimize=True), axis=2), 0.0)
     scatter = np.mean(scatter_variance(calibration, real, x_M), axis=2)
     ball = np.mean(list(calibration.balls.values()), axis=0)
     matrices = ProjectionMatrices(
@@ -121,8 +121,8 @@ def projection_matrices(
         p_u=own.p_u,
         p_v=own.p_v,
         pose_id=poses.pose_id,
-        points_sigma=np.sqrt(np.maximum(shared, 0.0) + scatter),
-        points_sigma_shared=np.sqrt(np.maximum(shared, 0.0)),
+        points_sigma=np.sqrt(shared + scatter),
+        points_sigma_shared=np.sqrt(shared),
         scanner=own,
         in_front=T_MW[:3, :3] @ ball + T_MW[:3, 3],
     )

@@ -40,7 +40,7 @@ from tomopose.errors import NotConvergedError, TrajectoryError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import exp_rotation, skew
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.least_squares import Solution, Status, least_squares
+from tomopose.least_squares import Status, least_squares, promised
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.manipulator.real_poses import ErrorModel, Repeatability
 from tomopose.manipulator.twin import TwinRobots
@@ -253,10 +253,10 @@ def _bar_rows(problem: KinematicProblem, state: State) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Point:
-    """A state, its linearisation (None where no machine or scanner has such errors), and the whiteners in use."""
+    """A state, its linearisation (r not finite where no machine or scanner has such errors), the whiteners in use."""
 
     state: State
-    at: Linearised | None
+    at: Linearised
     W: Array
 
 
@@ -280,8 +280,6 @@ def solve_map(problem: KinematicProblem, start: State, *, steps: int = STEPS, un
     """
 
     def rows(point: _Point) -> tuple[Array, Array]:
-        if point.at is None:
-            return np.full(1, np.nan), np.zeros((1, 0))
         return _weighted(problem, point.state, point.at, point.W)
 
     def moved(point: _Point, step: Array) -> _Point:
@@ -289,30 +287,20 @@ def solve_map(problem: KinematicProblem, start: State, *, steps: int = STEPS, un
             state = point.state.moved(step)
             return _Point(state=state, at=linearise(problem, state), W=point.W)
         except (TrajectoryError, ImpossibleScannerError):
-            return replace(point, at=None)
+            return replace(point, at=replace(point.at, r=np.full_like(point.at.r, np.nan)))
 
     def renewed(point: _Point) -> _Point:
-        return point if point.at is None else replace(point, W=whiteners(point.at.C))
+        return replace(point, W=whiteners(point.at.C))
 
     at = linearise(problem, start)
     begin = _Point(state=start, at=at, W=whiteners(at.C))
     found = least_squares(rows, moved, begin, steps=steps, tolerance=STEP_TOLERANCE, damping=0.0, renewed=renewed)
     if found.status is Status.NO_START:
         raise NotConvergedError("at the start a ball lies behind the source; the start is too far off")
-    if not (unfinished or found.status is Status.CONVERGED or _promised(found) < VALLEY_TOLERANCE * len(found.r)):
+    flat = VALLEY_TOLERANCE * len(found.r)
+    if not (unfinished or found.status is Status.CONVERGED or promised(found.J, found.r) < flat):
         raise NotConvergedError(f"{found.status.value}: chi2 is {found.cost:.6g} for {len(found.r)} equations")
-    assert found.state.at is not None
     return _estimate(problem, found.state.state, found.r, found.J, found.state.at)
-
-
-def _promised(found: Solution[_Point]) -> float:
-    """What chi2 would still fall by, were the problem linear; infinite where a direction is open."""
-    factor = _factor(found.J)
-    if factor is None:
-        return np.inf
-    L, scale = factor
-    z = solve_triangular(L, found.J.T @ found.r / scale, lower=True)
-    return float(z @ z)
 
 
 def _factor(J: Array) -> tuple[Array, Array] | None:

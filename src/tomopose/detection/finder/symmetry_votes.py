@@ -46,33 +46,36 @@ def _gradient_square(image, out):  # type: ignore[no-untyped-def]
             out[j, i] = gu * gu + gv * gv
 
 
+@njit(cache=True, inline="always")
+def _vote_along(out, band, i, j, du, dv, radii):  # type: ignore[no-untyped-def]
+    """The votes of an edge at (i, j) for the centres of a band's radii in the direction (du, dv)."""
+    for radius in range(radii[band, 0], radii[band, 1] + 1):
+        x, y = round(i + radius * du), round(j + radius * dv)
+        if 0 <= x < out.shape[2] and 0 <= y < out.shape[1]:
+            out[band, y, x] += 1.0 / (2.0 * math.pi * radius)
+
+
 @njit(cache=True, error_model="numpy")
 def _votes(image, square, threshold, radii, out):  # type: ignore[no-untyped-def]
     """Adds to `out` (polarity, band, rows, columns): 1 for a full circle about that centre; polarity 0 is dark inside.
 
     radii: (bands, 2), the first and the last of each band that an edge votes for.
     """
-    rows, columns = image.shape
-    inner, bands = columns - 2, radii.shape[0]
-    for p in range((rows - 2) * inner):
-        j, i = p // inner + 1, p % inner + 1
-        here = square[j, i]
-        if not here > threshold:
-            continue
-        gu = image[j, i + 1] - image[j, i - 1]
-        gv = image[j + 1, i] - image[j - 1, i]
-        length = math.sqrt(here)
-        gu, gv = gu / length, gv / length
-        du, dv = round(gu), round(gv)
-        if square[j + dv, i + du] > here or square[j - dv, i - du] >= here:
-            continue
-        for k in range(2 * bands):
-            polarity, band = k // bands, k % bands
-            sign = -1.0 if polarity == 0 else 1.0
-            for radius in range(radii[band, 0], radii[band, 1] + 1):
-                x, y = round(i + radius * (sign * gu)), round(j + radius * (sign * gv))
-                if 0 <= x < columns and 0 <= y < rows:
-                    out[polarity, band, y, x] += 1.0 / (2.0 * math.pi * radius)
+    for j in range(1, image.shape[0] - 1):
+        for i in range(1, image.shape[1] - 1):
+            here = square[j, i]
+            if not here > threshold:
+                continue
+            gu = image[j, i + 1] - image[j, i - 1]
+            gv = image[j + 1, i] - image[j - 1, i]
+            length = math.sqrt(here)
+            gu, gv = gu / length, gv / length
+            du, dv = round(gu), round(gv)
+            if square[j + dv, i + du] > here or square[j - dv, i - du] >= here:
+                continue
+            for k in range(2 * radii.shape[0]):
+                sign = -1.0 if k < radii.shape[0] else 1.0
+                _vote_along(out[k // radii.shape[0]], k % radii.shape[0], i, j, sign * gu, sign * gv, radii)
 
 
 @njit(cache=True)

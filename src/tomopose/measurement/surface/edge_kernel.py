@@ -67,7 +67,7 @@ def _profile(c: Array, p: Array, n: Array, s_0: float, window: float, g: Array) 
 
 
 @njit(cache=True)
-def _plateaus(g: Array) -> Any:
+def plateaus(g: Array) -> Any:
     """Means of the first and last voxel of a profile."""
     per_voxel = round(1.0 / STEP) + 1
     a, b = 0.0, 0.0
@@ -78,7 +78,7 @@ def _plateaus(g: Array) -> Any:
 
 
 @njit(cache=True)
-def _crossing(g: Array, level: float, window: float) -> Any:
+def crossing(g: Array, level: float, window: float) -> Any:
     """Falling crossing of `level` nearest to the middle, s relative to it; nan where there is no crossing."""
     best = np.nan
     for k in range(g.shape[0] - 1):
@@ -134,7 +134,7 @@ def _another_edge(g: Array, s: float, a: float, b: float, window: float) -> Any:
 
 
 @njit(cache=True)
-def _fit_edge(g: Array, sigma: float, window: float, start: float, a: float, b: float, out: Array) -> Any:
+def fit_edge(g: Array, sigma: float, window: float, start: float, a: float, b: float, out: Array) -> Any:
     """Gauss-Newton for s_0, a, b; writes a row of results, s_0 relative to the profile's middle.  True if converged."""
     m = g.shape[0]
     s_0, converged = start, False
@@ -294,15 +294,15 @@ def search_lines(
             if not _profile(c, index[i], step[i], middle, window, g):
                 flags[i] = BORDER
                 break
-            a, b = _plateaus(g)
-            s = _crossing(g, 0.5 * (a + b), window)
+            a, b = plateaus(g)
+            s = crossing(g, 0.5 * (a + b), window)
             if not (a > b and math.isfinite(s)):
                 flags[i] = NO_EDGE
                 break
             if _another_edge(g, s, a, b, window):
                 flags[i] |= THIN
             if fit:
-                if not _fit_edge(g, sigma, window, s, a, b, result[i]):
+                if not fit_edge(g, sigma, window, s, a, b, result[i]):
                     flags[i] |= NOT_CONVERGED
                     break
             else:

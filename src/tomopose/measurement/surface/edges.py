@@ -153,7 +153,7 @@ def search_edges(
     sigma = None if settings.sigma is None else settings.sigma / unit
     if sigma is None:
         sigma = _estimated_sigma(volume, index, step, settings)
-    window = _window(settings, sigma)
+    window = fit_window(settings, sigma)
     result = np.full((len(x), kernel.N_COLUMNS), np.nan)
     flags = np.full(len(x), kernel.BORDER, dtype=np.uint8)
     n_z = volume.grid.shape[0]
@@ -181,7 +181,8 @@ def _checked(points: npt.ArrayLike, normals: npt.ArrayLike) -> tuple[Array, Arra
     return x, n / length[:, None]
 
 
-def _window(settings: EdgeSettings, sigma: float) -> float:
+def fit_window(settings: EdgeSettings, sigma: float) -> float:
+    """Half length, voxels, of the profile that is fitted where the blur is sigma, voxels."""
     window = 2.5 * sigma + 1.5 if settings.window is None else settings.window
     return round(window / kernel.STEP) * kernel.STEP
 
@@ -220,17 +221,17 @@ def _estimated_sigma(volume: Volume, index: Array, step: Array, settings: EdgeSe
     slab = np.clip(index[:, 0] // layers, 0, None).astype(np.intp)
     rows = np.flatnonzero(slab == np.argmax(np.bincount(slab)))
     rows = rows[:: max(len(rows) // SIGMA_SAMPLE, 1)]
-    reach = (settings.search_distance + 2 * _window(settings, SIGMA_RANGE[1]) + 2) * np.abs(step).max(axis=0)
+    reach = (settings.search_distance + 2 * fit_window(settings, SIGMA_RANGE[1]) + 2) * np.abs(step).max(axis=0)
     low, high = _part(index[rows], reach, volume.grid.shape)
     coefficients = spline_coefficients(volume.values[low[0] : high[0], low[1] : high[1], low[2] : high[2]])
-    sigma = START_SIGMA
-    for _ in range(SIGMA_ROUNDS):
+
+    def edges(sigma: float) -> tuple[Array, np.ndarray]:
         result, flags = kernel.search_lines(
             coefficients,
             index[rows] - low,
             step[rows],
             sigma,
-            _window(settings, sigma),
+            fit_window(settings, sigma),
             settings.search_distance,
             True,
             0.0,
@@ -241,12 +242,28 @@ def _estimated_sigma(volume: Volume, index: Array, step: Array, settings: EdgeSe
                 f"no edge was found at any of {len(rows)} points looked at ({counts_in_words(flags)}): grey levels do "
                 "not fall along the normals, the surface is farther than the search distance, or walls are too thin"
             )
+        return result, good
+
+    return common_sigma(edges, rounds=SIGMA_ROUNDS, tolerance=SIGMA_TOLERANCE)
+
+
+def common_sigma(edges: Callable[[float], tuple[Array, np.ndarray]], *, rounds: int, tolerance: float) -> float:
+    """The blur, voxels, for which least squares common to all edges are least.
+
+    edges: sigma -> the rows of results (n, N_COLUMNS) of fits with that blur, and (n,) which of them are edges; where
+    none is, the iteration ends.  tolerance: voxels, of the last change.
+    """
+    sigma = START_SIGMA
+    for _ in range(rounds):
+        result, good = edges(sigma)
+        if not good.any():
+            break
         contrast = result[:, kernel.A] - result[:, kernel.B]
         good &= contrast > 0.5 * np.median(contrast[good])
         good &= result[:, kernel.RMS] <= 3 * np.median(result[good, kernel.RMS]) + 1e-12 * np.abs(contrast)
         change = float(result[good, kernel.D_SIGMA].sum() / result[good, kernel.D_SIGMA_2].sum())
         sigma = float(np.clip(sigma + np.clip(change, -0.5, 0.5), *SIGMA_RANGE))
-        if abs(change) < SIGMA_TOLERANCE:
+        if abs(change) < tolerance:
             break
     return sigma
 

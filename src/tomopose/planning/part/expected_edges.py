@@ -16,12 +16,13 @@ from numba import njit
 from scipy.special import erfc
 
 from tomopose.measurement.surface import edge_kernel as kernel
+from tomopose.measurement.surface.edges import EdgeSettings, common_sigma, fit_window
 from tomopose.planning.part.sart_response import SartResponse
 from tomopose.units import Array
 
 SIGMA_POINTS, SIGMA_ROUNDS, SIGMA_TOLERANCE = 400, 25, 0.01
-SIGMA_RANGE = (0.3, 4.0)
-START_SIGMA = 1.0
+"""Points looked at, steps at the most, and voxels of the last change: coarser than a measurement's."""
+SETTINGS = EdgeSettings()
 FEWEST_EDGES = 0.2
 """Share of a feature's points with an edge, below which nothing is said of it."""
 
@@ -40,20 +41,16 @@ def _fit(profiles: np.ndarray, sigma: float, window: float, out: np.ndarray) -> 
     """(m,) bool: whether a blurred step fits each profile (m, k); writes rows of results."""
     good = np.zeros(len(profiles), dtype=np.bool_)
     for i in range(len(profiles)):
-        a, b = kernel._plateaus(profiles[i])
-        s = kernel._crossing(profiles[i], 0.5 * (a + b), window)
+        a, b = kernel.plateaus(profiles[i])
+        s = kernel.crossing(profiles[i], 0.5 * (a + b), window)
         if a > b and math.isfinite(s):
-            good[i] = kernel._fit_edge(profiles[i], sigma, window, s, a, b, out[i])
+            good[i] = kernel.fit_edge(profiles[i], sigma, window, s, a, b, out[i])
     return good
-
-
-def _window(sigma: float) -> float:
-    return round((2.5 * sigma + 1.5) / kernel.STEP) * kernel.STEP
 
 
 def _profiles(response: SartResponse, x: Array, n: Array, sigma: float) -> tuple[Array, Array, Array]:
     """(places s (k,) in voxels, samples (m, k, 3) mm, grey levels (m, k)) along normals n from points x (m, 3)."""
-    window = _window(sigma)
+    window = fit_window(SETTINGS, sigma)
     s = np.linspace(-window, window, 2 * round(window / kernel.STEP) + 1, dtype=np.float64)
     samples = x[:, None] + response.voxel * s[None, :, None] * n[:, None]
     return s, samples, response.at(samples.reshape(-1, 3)).reshape(len(x), len(s))
@@ -61,25 +58,17 @@ def _profiles(response: SartResponse, x: Array, n: Array, sigma: float) -> tuple
 
 def _fitted(profiles: Array, sigma: float) -> tuple[Array, np.ndarray]:
     out = np.full((len(profiles), kernel.N_COLUMNS), np.nan)
-    return out, _fit(profiles, sigma, _window(sigma), out)
+    return out, _fit(profiles, sigma, fit_window(SETTINGS, sigma), out)
 
 
 def _blur(response: SartResponse, x: Array, n: Array) -> float:
     """Common standard width of a feature's edges, voxels, as the measurement estimates it."""
     rows = np.linspace(0, len(x) - 1, min(len(x), SIGMA_POINTS)).astype(int)
-    sigma = START_SIGMA
-    for _ in range(SIGMA_ROUNDS):
-        out, good = _fitted(_profiles(response, x[rows], n[rows], sigma)[2], sigma)
-        if not good.any():
-            return sigma
-        contrast = out[:, kernel.A] - out[:, kernel.B]
-        good &= contrast > 0.5 * np.median(contrast[good])
-        good &= out[:, kernel.RMS] <= 3 * np.median(out[good, kernel.RMS])
-        change = float(out[good, kernel.D_SIGMA].sum() / out[good, kernel.D_SIGMA_2].sum())
-        sigma = float(np.clip(sigma + np.clip(change, -0.5, 0.5), *SIGMA_RANGE))
-        if abs(change) < SIGMA_TOLERANCE:
-            break
-    return sigma
+    return common_sigma(
+        lambda sigma: _fitted(_profiles(response, x[rows], n[rows], sigma)[2], sigma),
+        rounds=SIGMA_ROUNDS,
+        tolerance=SIGMA_TOLERANCE,
+    )
 
 
 def expected_edges(response: SartResponse, x: Array, n: Array) -> ExpectedEdges:

@@ -91,7 +91,9 @@ def allowed(machine: Machine, part: Part, q: Array, *, margin: float) -> np.ndar
 def _motions(machine: Machine, q: Array) -> tuple[RigidTransform, RigidTransform]:
     """(part at home in W -> W, table -> W) of axes (n, 7)."""
     moved = object_motion(machine.scanner, T_HT=machine.T_HT, T_MH=machine.poses(q).T_MH, alpha=q[:, 6])
-    return RigidTransform.from_matrix(moved, source=Frame.W, target=Frame.W), machine.scanner.T_TW(q[:, 6])
+    return RigidTransform.of_rotations(moved[:, :3, :3], moved[:, :3, 3], Frame.W, Frame.W), machine.scanner.T_TW(
+        q[:, 6]
+    )
 
 
 def tilted(machine: Machine, alpha: Array, tilt: Array, lift: Array, centre: Array) -> Array:

@@ -1,4 +1,4 @@
-r"""What a photon leaves in a scintillator: E less what escapes as K fluorescence and as Compton-scattered light.
+r"""What a photon leaves in a scintillator: E less what escapes as K fluorescence and as Compton-scattered photons.
 
 A photon of energy E that enters a layer of thickness t interacts at depth x with density mu exp(-mu x), mu without
 coherent scattering, which changes neither its energy nor, much, its direction.
@@ -10,7 +10,8 @@ E_l is emitted, equally in all directions.  Of a plane source at depth x the sha
 Compton: a photon of energy E' leaves at an angle to E by Klein and Nishina (Z. Phys. 52 (1929) 853); E - E' stays, and
 of E' what the photoelectric effect takes on the straight way out.
 
-One generation is followed: photons that scatter twice and K lines of K lines are left out (each below 2 % of E).
+One generation is followed: photons that scatter twice and K lines of K lines are left out (a random walk that follows
+them, in the tests, differs by less than 2 %).
 Yields, jumps and lines are those of Elam, Ravel and Sieber (Radiat. Phys. Chem. 63 (2002) 121), by xraydb.
 """
 
@@ -30,10 +31,15 @@ SOFTEST_KEV = 5.0
 """Lines below are absorbed where they are made."""
 
 
+def _mu_of(material: Material, element: str, energy: Array, process: str) -> Array:
+    """1/mm: what one element of a material attenuates by one process, "photo" or "incoh"."""
+    mu = xraydb().mu_elam(element, energy * 1e3, kind=process)
+    return np.asarray(material.fractions[element] * mu * material.density * CM2_PER_G_TO_MM)
+
+
 def _mu(material: Material, energy: Array, process: str) -> Array:
-    """1/mm: attenuation by one process, "photo" or "incoh"."""
-    parts = [share * xraydb().mu_elam(e, energy * 1e3, kind=process) for e, share in material.fractions.items()]
-    return np.asarray(sum(parts)) * material.density * CM2_PER_G_TO_MM
+    """1/mm: attenuation by one process."""
+    return np.asarray(sum(_mu_of(material, element, energy, process) for element in material.fractions))
 
 
 def deposited_energy(material: Material, thickness: float, energy: Array) -> Array:
@@ -44,23 +50,22 @@ def deposited_energy(material: Material, thickness: float, energy: Array) -> Arr
     x = thickness * (node + 1) / 2
     # interactions at each depth, per photon
     density = np.exp(-(tau + sigma)[:, None] * x) * weight * thickness / 2
-    photo = E[:, None] - _escaping_fluorescence(material, thickness, E, x)
+    photo = E[:, None] - _escaping_fluorescence(material, thickness, E, tau, x)
     stays = np.sum(density * tau[:, None] * photo, axis=1)
     scattered = _kept_of_compton(material, thickness, E, x)
     return np.asarray(stays + np.sum(density * sigma[:, None] * scattered, axis=1))
 
 
-def _escaping_fluorescence(material: Material, thickness: float, E: Array, x: Array) -> Array:
-    """keV (n, m): what K lines carry out, for each photoelectric event at depths x (m,)."""
-    total = _mu(material, E, "photo")
+def _escaping_fluorescence(material: Material, thickness: float, E: Array, tau: Array, x: Array) -> Array:
+    """keV (n, m): what K lines carry out, for each photoelectric event (tau (n,) 1/mm) at depths x (m,)."""
     lost = np.zeros((len(E), len(x)))
-    for element, share in material.fractions.items():
+    for element in material.fractions:
         edge = xraydb().xray_edge(element, "K")
         edge_keV = edge.energy / 1e3
         if edge_keV < SOFTEST_KEV:
             continue
-        own = share * xraydb().mu_elam(element, E * 1e3, kind="photo") * material.density * CM2_PER_G_TO_MM
-        chance = np.where(edge_keV < E, own / total * (1 - 1 / edge.jump_ratio) * edge.fyield, 0.0)
+        own = _mu_of(material, element, E, "photo")
+        chance = np.where(edge_keV < E, own / tau * (1 - 1 / edge.jump_ratio) * edge.fyield, 0.0)
         for line in xraydb().xray_lines(element, "K").values():
             E_l = line.energy / 1e3
             mu_l = float(_mu(material, np.array([E_l]), "photo")[0])

@@ -149,6 +149,14 @@ def fill_pixel(
             )
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _add_to_cells(out: np.ndarray, row: int, column: int, f: int, weight: float) -> None:
+    """Add weight to the mean of the f x f cells from (row, column) on."""
+    for a in range(f):
+        for b in range(f):
+            out[0, row + a, column + b] += weight
+
+
 @njit(cache=True, nogil=True)
 def fill_smooth(
     I: np.ndarray, seen: np.ndarray, f: int, j_0: int, j_1: int, weight: float, out: np.ndarray, rough: np.ndarray
@@ -161,8 +169,7 @@ def fill_smooth(
             if rough[j, i]:
                 continue
             if seen[j, i] == 0:
-                for a in range(f * f):
-                    out[0, j * f + a // f, i * f + a % f] += weight
+                _add_to_cells(out, j * f, i * f, f, weight)
                 continue
             f_00, f_01, f_10, f_11 = I[j, i], I[j, i + 1], I[j + 1, i], I[j + 1, i + 1]
             I_uu = 0.25 * (I[j, i - 1] - f_00 - f_01 + I[j, i + 2] + I[j + 1, i - 1] - f_10 - f_11 + I[j + 1, i + 2])

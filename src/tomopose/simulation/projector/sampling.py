@@ -175,7 +175,7 @@ def corners(
                 if seen[j, i] < 0:
                     fine = False
                 met = 0
-                for k in range(len(work.active)):
+                for k in range(len(work.active) if step > 1 else 0):
                     met += work.active[k]
                 if step > 1 and met != work.S[-1, -1]:
                     seen[j, i] = 0
