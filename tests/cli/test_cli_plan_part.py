@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import tomopose as tp
 from tomopose.cli.main import run
 from tomopose.cli.plan_scan import PartOptions
 from tomopose.io.foreign.reading import read_pose_log
+from tomopose.manipulator.virtual import typical_robot
 from tomopose.planning.part.settings import PartSettings
 
 SCANNER = tp.Scanner(
@@ -116,6 +118,25 @@ def test_bad_input_is_answered_in_words_and_leaves_nothing(words, tmp_path, caps
     assert not list(tmp_path.glob("scan.*"))
 
 
+@pytest.mark.slow
+def test_a_robots_plan_holds_its_joint_values_and_their_strokes(words, tmp_path):
+    robot = typical_robot()
+    asked = [*words, "--mu-per-mm", "0.05", "--views", "4", "--manipulator", str(tmp_path / "robot.json")]
+    joints = [replace(j, limits=(q - 0.4, q + 0.4)) for j, q in zip(robot.joints, robot.q_start.tolist(), strict=True)]
+    robot = replace(robot, joints=joints)
+    tp.write_manipulator(tmp_path / "robot.json", robot)
+    assert run([*asked, "--commands", "kuka-krl"]) == 0
+    poses = tp.read_poses(tmp_path / "scan.csv")
+    assert (np.abs(poses.q - robot.q_start) <= 0.4).all()
+    np.testing.assert_allclose(robot.forward(poses.q).matrix, poses.T_MH.matrix, atol=1e-8)
+    document = json.loads((tmp_path / "scan.json").read_text())
+    np.testing.assert_allclose(document["home"], robot.forward(robot.q_start[None]).matrix[0], atol=1e-9)
+    np.testing.assert_allclose([j["highest"] for j in document["joints"]], np.degrees(poses.q.max(axis=0)))
+    assert "joint 6, deg" in (tmp_path / "scan.html").read_text()
+    back = read_pose_log(tmp_path / "scan.src").poses()
+    np.testing.assert_allclose(back.T_MH.t, poses.T_MH.t, atol=1e-6)
+
+
 def test_an_open_part_is_refused(words, tmp_path, capsys):
     path = tmp_path / "part.obj"
     path.write_text("\n".join(path.read_text().splitlines()[:-1]))
@@ -149,14 +170,14 @@ def test_a_continuous_scan_writes_its_way_and_says_whether_fdk_follows_it(words,
     assert np.degrees(np.diff(way.alpha)).max() <= 0.5 + 1e-9
 
 
-def test_a_manipulator_without_stroke_or_a_robot_is_refused(words, tmp_path, capsys):
+def test_a_manipulator_without_known_strokes_is_refused(words, tmp_path, capsys):
     joints = {"a_mm": 100, "alpha_deg": 90, "d_mm": 10}
     angle = np.radians([0, 60, 120, 180, 240, 300])
     ring = np.column_stack([100 * np.cos(angle), 100 * np.sin(angle), np.full(6, -200.0)])
     plates = {"base_joints_mm": ring.tolist(), "platform_joints_mm": (0.6 * ring).tolist()}
     for content, match in (
         ({"schema": "tomopose/hexapod/1", **plates}, "leg_limits_mm is missing"),
-        ({"schema": "tomopose/serial/1", "convention": "dh", "joints": [joints] * 6}, "describes a robot"),
+        ({"schema": "tomopose/serial/1", "convention": "dh", "joints": [joints] * 6}, "joint 1 of the robot has no limits_deg"),
     ):
         (tmp_path / "machine.json").write_text(json.dumps(content))
         assert run([*words, "--mu-per-mm", "0.05", "--manipulator", str(tmp_path / "machine.json")]) == 1

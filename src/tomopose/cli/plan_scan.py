@@ -18,6 +18,7 @@ from tomopose.cli.plan_poses import SUFFIXES
 if TYPE_CHECKING:
     from tomopose import Calibration, PoseSequence, Scanner
     from tomopose.manipulator.hexapod import Hexapod
+    from tomopose.manipulator.serial import SerialRobot
     from tomopose.planning.part.settings import PartSettings
     from tomopose.planning.part_scan.freedoms import Freedom, Placing
     from tomopose.planning.part_scan.plan import PartScanPlan
@@ -111,7 +112,8 @@ class PartOptions:
         float, typer.Option("--room-mm", help="By how much the reconstructed box exceeds the part on each side.")
     ] = 5.0
     manipulator: Annotated[
-        Path | None, typer.Option("--manipulator", help="hexapod.json: its legs have to stay within their stroke.")
+        Path | None,
+        typer.Option("--manipulator", help="hexapod.json or robot.json: its legs or joints keep to their stroke."),
     ] = None
     continuous: Annotated[
         bool, typer.Option("--continuous", help="Views on one smooth turn, without stops; also writes scan.way.csv.")
@@ -262,7 +264,7 @@ def _scanner(o: Options, cal: Calibration | None) -> Scanner:
     return cal.scanner
 
 
-def _hexapod(o: Options) -> Hexapod | None:
+def _manipulator(o: Options) -> Hexapod | SerialRobot | None:
     import tomopose as tp
     from tomopose.errors import InputError
     from tomopose.manipulator.hexapod import Hexapod
@@ -270,12 +272,7 @@ def _hexapod(o: Options) -> Hexapod | None:
     if o.manipulator is None:
         return None
     found = tp.read_manipulator(o.manipulator)
-    if not isinstance(found, Hexapod):
-        raise InputError(
-            f"{o.manipulator}: a scan of a part is planned for a hexapod, whose zero is the middle of its travel; this "
-            "file describes a robot"
-        )
-    if found.leg_limits is None:
+    if isinstance(found, Hexapod) and found.leg_limits is None:
         raise InputError(f"{o.manipulator}: leg_limits_mm is missing; without it nobody knows the stroke of the legs")
     return found
 
@@ -303,7 +300,7 @@ def _planned(o: Options) -> int:
         features=None if o.features is None else read_plan(o.features),
         limits=ScanLimits() if o.limits is None else read_limits(o.limits),
         calibration=cal,
-        manipulator=_hexapod(o),
+        manipulator=_manipulator(o),
         continuous=o.continuous,
     )
     placing = None
@@ -368,11 +365,12 @@ def _write(o: Options, plan: PartScanPlan, attenuation: str, free: Sequence[Free
     made = _made(o)
     page = scan_plan_report(cast("ScanPlanFigures", document), surface, plan.source_path, provenance=made)
     paths = _beside(o)
-    tp.write_poses(paths[0], plan.poses, force=o.force)
+    units = plan.machine.joint_units
+    tp.write_poses(paths[0], plan.poses, joint_units=units, force=o.force)
     write_json(paths[1], "scan-plan", {**document, "provenance": made.to_json()})
     write_report(paths[2], page)
     if plan.way is not None:
-        tp.write_poses(paths[3], plan.machine.poses(plan.way), force=o.force)
+        tp.write_poses(paths[3], plan.machine.commanded(plan.way), joint_units=units, force=o.force)
     if o.commands is not None:
         write_text(paths[-1], command_list(plan.poses, o.commands))
     lines = [f"{o.out}: {len(plan)} views of {plan.goal.part.name}; attenuation {attenuation}"]

@@ -22,6 +22,8 @@ SMALLEST_PLATE_MM, LARGEST_PLATE_MM = 5.0, 5000.0
 """A plate's joints spread over less are taken for metres, over more for micrometres."""
 SMALLEST_REACH_MM, LARGEST_REACH_MM = 20.0, 20000.0
 LARGEST_JOINT_SIGMA_MM = 20.0
+WHOLE_DEG = 0.1
+"""Limits of a joint that come this near to whole degrees when they are read as rad, and are none as they are."""
 CONFIRM = 'convert them, or add "units": "confirmed" if the numbers are right'
 
 HEXAPOD_KEYS = (
@@ -54,7 +56,7 @@ SERIAL_KEYS = (
     "comment",
     "provenance",
 )
-JOINT_KEYS = ("a_mm", "alpha_deg", "d_mm", "theta_offset_deg", "kind", "sigma", "name")
+JOINT_KEYS = ("a_mm", "alpha_deg", "d_mm", "theta_offset_deg", "kind", "sigma", "limits_deg", "limits_mm", "name")
 
 
 @reader("manipulator file")
@@ -203,7 +205,29 @@ def _joint(block: object, where: str, confirmed: bool) -> Joint:
         theta_offset=float(np.radians(offset)),
         kind=kind,
         sigma=sigma,
+        limits=_limits(block, kind, where, confirmed),
     )
+
+
+def _limits(block: Mapping[str, Any], kind: str, where: str, confirmed: bool) -> tuple[float, float] | None:
+    """(lowest, highest) joint value, rad or mm."""
+    key, other = ("limits_deg", "limits_mm") if kind == "turning" else ("limits_mm", "limits_deg")
+    if other in block:
+        raise UnitError(f"{where}: a {kind} joint has {key}, not {other}")
+    if key not in block:
+        return None
+    low, high = vector(block[key], (2,), key, where).tolist()
+    if not low < high:
+        raise InputError(f"{where}: {key} is [{low:g}, {high:g}]; [lowest, highest] is needed")
+    if kind == "turning" and not confirmed and _look_like_radians((low, high)):
+        raise UnitError(f"{where}: {key} is [{low:g}, {high:g}], whole degrees if they are rad; {CONFIRM}")
+    return (float(np.radians(low)), float(np.radians(high))) if kind == "turning" else (low, high)
+
+
+def _look_like_radians(limits: tuple[float, float]) -> bool:
+    if max(abs(x) for x in limits) > 2 * np.pi + 1e-3 or all(float(x).is_integer() for x in limits):
+        return False
+    return all(abs(np.degrees(x) - round(np.degrees(x))) < WHOLE_DEG for x in limits)
 
 
 def _repeatability(document: Mapping[str, object], where: str) -> Repeatability:

@@ -56,7 +56,10 @@ TOOL_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class Joint:
-    """One joint and its link: a, d mm; alpha, theta_offset rad; sigma: error name -> standard deviation (mm, rad)."""
+    """One joint and its link: a, d mm; alpha, theta_offset rad; sigma: error name -> standard deviation (mm, rad).
+
+    limits: (lowest, highest) value of the joint, rad or mm, or None where the file does not say.
+    """
 
     a: float
     alpha: float
@@ -64,11 +67,14 @@ class Joint:
     theta_offset: float = 0.0
     kind: JointKind = "turning"
     sigma: Mapping[str, float] = field(default_factory=dict)
+    limits: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         for name in ("a", "alpha", "d", "theta_offset"):
             if not np.isfinite(getattr(self, name)):
                 raise InputError(f"joint: {name} is {getattr(self, name)}, not a finite number")
+        if self.limits is not None and not self.limits[0] < self.limits[1]:
+            raise InputError(f"joint: limits are {self.limits}; (lowest, highest) is needed")
         for name, value in self.sigma.items():
             if name not in ERRORS:
                 raise InputError(f"joint: there is no error {name!r}; known are {', '.join(ERRORS)}")
@@ -240,8 +246,7 @@ class SerialRobot:
                 "poses are given in the robot's base",
                 indices=bad.tolist(),
             )
-        singular_values = np.linalg.svd(J, compute_uv=False)
-        condition = singular_values[:, 0] / np.maximum(singular_values[:, -1], 1e-300)
+        condition = np.linalg.cond(J)
         bad = np.flatnonzero(condition > SINGULAR_CONDITION)
         if bad.size:
             raise TrajectoryError(
@@ -250,6 +255,11 @@ class SerialRobot:
                 indices=bad.tolist(),
             )
         return q
+
+    def approached(self, T_MH: RigidTransform, q: Array) -> tuple[Array, np.ndarray]:
+        """(joint values (n, m), from q (n, m) on, (n,) bool: whether they reach the poses and are not singular)."""
+        q, left, J = self._approach(T_MH, np.array(q, dtype=np.float64))
+        return q, (left < IK_TOLERANCE) & (np.linalg.cond(J) <= SINGULAR_CONDITION)
 
     @property
     def _length(self) -> float:
@@ -341,14 +351,10 @@ class SerialRobot:
                     "d_mm": j.d,
                     "theta_offset_deg": float(np.degrees(j.theta_offset)),
                     "kind": j.kind,
-                    "sigma": {
-                        f"{name}_{'mm' if ERRORS[name] == 'mm' else 'deg'}": value
-                        if ERRORS[name] == "mm"
-                        else float(np.degrees(value))
-                        for name, value in j.sigma.items()
-                    },
+                    "sigma": dict(_written(name, ERRORS[name], value) for name, value in j.sigma.items()),
+                    **({} if j.limits is None else {f"limits_{u}": [_written("", u, x)[1] for x in j.limits]}),
                 }
-                for j in self.joints
+                for j, u in zip(self.joints, self.joint_units, strict=True)
             ],
             "tool": np.asarray(self.tool).tolist(),
             "q_start_deg": np.where(
@@ -363,6 +369,11 @@ def poses_from_joints(robot: SerialRobot, q: Array, **columns: Any) -> PoseSeque
     T_MH = robot.forward(q)
     pose_id = columns.pop("pose_id", tuple(str(k) for k in range(len(T_MH))))
     return PoseSequence(T_MH=T_MH, q=q, pose_id=tuple(pose_id), **columns)
+
+
+def _written(name: str, unit: str, value: float) -> tuple[str, float]:
+    """A number of robot.json, its key with the unit: deg for rad."""
+    return (f"{name}_mm", value) if unit == "mm" else (f"{name}_deg", float(np.degrees(value)))
 
 
 def _turn(R: Array) -> Array:

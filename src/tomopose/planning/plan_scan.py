@@ -14,6 +14,7 @@ from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.geometry.scanner import Scanner
 from tomopose.manipulator.hexapod import Hexapod
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.manipulator.serial import SerialRobot
 from tomopose.measurement.mesh.mesh import Mesh
 from tomopose.measurement.plan import MeasurementPlan
 from tomopose.planning.part.part import Part, read_part, require_simple
@@ -58,7 +59,7 @@ def plan_scan(
     calibration: Calibration | None = None,
     features: MeasurementPlan | None = None,
     limits: str | Path | None = None,
-    manipulator: Hexapod | None = None,
+    manipulator: Hexapod | SerialRobot | None = None,
     continuous: bool = False,
     options: Mapping[str, float] | None = None,
 ) -> ScanPlan:
@@ -69,7 +70,8 @@ def plan_scan(
     scanner:     the calibration's unless given;  calibration: mount, pivot and shared uncertainty.
     features:    what is to be measured; the whole surface without.
     limits:      limits.toml; +-10 mm, +-5 deg and a table that turns freely without.
-    manipulator: a hexapod whose legs have to stay within their stroke.
+    manipulator: a hexapod or a robot whose legs or joints have to stay within their stroke; a robot's poses are counted
+                 from its working pose, where the part lies in W, and come with their joint values.
     continuous:  whether the views lie on one smooth turn.
     options:     of the objective and the prediction: least_transmission, tangent (rad), tuy_width (rad), margin (px),
                  quanta, readout, blur (px), sweeps, room (mm), alpha_step and tilt_step (rad), seed ...
@@ -109,7 +111,7 @@ def plan_scan(
         u_mm=dict(plan.chosen.lengths),
         unseen=dict(plan.unseen),
         document=plan_document(plan),
-        way=None if plan.way is None else plan.machine.poses(np.asarray(plan.way)),
+        way=None if plan.way is None else plan.machine.commanded(np.asarray(plan.way)),
     )
 
 

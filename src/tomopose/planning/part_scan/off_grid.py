@@ -5,6 +5,8 @@ The tolerance of a tangent is finer than the grid, so a view of the grid often m
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from tomopose.planning.part.settings import WEIGHTS
@@ -23,12 +25,14 @@ def refine_off_grid(goal: Goal, machine: Machine, q: Array, views: Views) -> tup
     q, w, n = q.copy(), goal.w, len(q)
     P, A, tau, incidence = (np.array(a) for a in (views.P, views.A, views.tau, views.incidence))
     s = goal.settings
-    full = np.array([s.alpha_step, s.tilt_step, s.tilt_step, LIFT_STEP_MM])
+    full = {6: s.alpha_step, 3: s.tilt_step, 4: s.tilt_step, 2: LIFT_STEP_MM}
+    if machine.spin[1] > machine.spin[0]:
+        full[5] = s.alpha_step
     best, second, who = without_each(A, np.arange(n))
     for halving in range(1, ROUNDS + 1):
         for i in range(n):
             base = np.where(who == i, second, best)
-            around = _neighbours(machine, q[i], full / 2**halving)
+            around = _neighbours(machine, q[i], {axis: step / 2**halving for axis, step in full.items()})
             around = around[allowed(machine, goal.part, around, margin=s.margin)]
             if not len(around):
                 continue
@@ -47,12 +51,11 @@ def refine_off_grid(goal: Goal, machine: Machine, q: Array, views: Views) -> tup
     return q, Views(P=P, A=A, tau=tau, incidence=incidence)
 
 
-def _neighbours(machine: Machine, q: Array, step: Array) -> Array:
-    """(k, 7): one step up and down along alpha, rx, ry and z each, within the limits."""
-    columns = (6, 3, 4, 2)
-    moved = np.repeat(q[None], 2 * len(columns), axis=0)
-    for k, column in enumerate(columns):
-        moved[2 * k, column] += step[k]
-        moved[2 * k + 1, column] -= step[k]
+def _neighbours(machine: Machine, q: Array, steps: Mapping[int, float]) -> Array:
+    """(k, 7): one step up and down along each of the axes named, within the limits."""
+    moved = np.repeat(q[None], 2 * len(steps), axis=0)
+    for k, (axis, step) in enumerate(steps.items()):
+        moved[2 * k, axis] += step
+        moved[2 * k + 1, axis] -= step
     moved = machine.clipped(moved)
     return moved[(np.abs(moved - q) > 1e-12).any(axis=1)]

@@ -8,8 +8,8 @@ from functools import partial
 
 import numpy as np
 
-from tomopose.geometry.rotations import convention_from_rotation
-from tomopose.planning.part_scan.stations import FULL_TURN, Machine
+from tomopose.geometry.rotations import R_z, convention_from_rotation
+from tomopose.planning.part_scan.stations import FULL_TURN, Machine, shared, turns
 from tomopose.trajectory.feasibility import TOLERANCE
 from tomopose.trajectory.tilt import eq10_rotation, sine_wave, triangle_wave
 from tomopose.units import Array
@@ -30,13 +30,14 @@ def usual_paths(machine: Machine, N: int) -> dict[str, Array]:
 
 
 def _largest(machine: Machine, N: int, wave: Callable[[Array, float], Array]) -> Array:
-    low, high = machine.limits.low[6], machine.limits.high[6]
-    start = low if np.isfinite(low) else 0.0
-    alpha = start + np.arange(N) * FULL_TURN / N if machine.turns_freely else np.linspace(low, high, N)
+    turn = turns(machine, FULL_TURN / N)
+    if len(turn) != N:
+        turn = np.linspace(turn[0], turn[-1], N)
+    alpha, rz = shared(machine, turn)
 
     def axes(share: float) -> Array:
         q = np.zeros((N, 7))
-        R = eq10_rotation(alpha, wave(alpha, share), machine.T_HT.R)
+        R = eq10_rotation(alpha, wave(turn, share), machine.T_HT.R) @ R_z(rz)
         q[:, 3:6] = np.radians(convention_from_rotation(R, "pi-hexapod"))
         q[:, 6] = alpha
         # axes that may not be at zero take the nearest value that they may have

@@ -139,7 +139,7 @@ def plan_part_scan(setting: Setting, *, progress: Progress = _silent) -> PartSca
     progress("judging the plan and the usual paths on other points")
     judge = _Judge(goal=setting.goal(judged=True), machine=machine, setting=setting)
     return PartScanPlan(
-        poses=machine.poses(q),
+        poses=machine.commanded(q),
         planned_J=reached,
         bound=bound,
         candidates=len(q_all),
@@ -212,7 +212,10 @@ class _Judge:
         shared = None
         if self.setting.calibration is not None:
             x = np.array([t.x.mean(axis=0) for t in goal.targets])
-            sigma = projection_matrices(self.setting.calibration, self.machine.poses(q), points=x).points_sigma_shared
+            found = projection_matrices(
+                self.setting.calibration, self.machine.commanded(q), points=x, home=self.machine.home
+            )
+            sigma = found.points_sigma_shared
             assert sigma is not None
             shared = shared_part(goal, self.machine.scanner, P, np.asarray(sigma).reshape(-1, len(x)).mean(axis=0))
         found, lengths = predicted(goal, self.machine.scanner, P, views, plan=self.setting.features, shared=shared)

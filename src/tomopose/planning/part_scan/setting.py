@@ -8,6 +8,7 @@ from tomopose.calibration.result import Calibration
 from tomopose.errors import InputError, OutOfReachError
 from tomopose.geometry.scanner import Scanner
 from tomopose.manipulator.hexapod import Hexapod
+from tomopose.manipulator.serial import SerialRobot
 from tomopose.measurement.plan import MeasurementPlan
 from tomopose.planning.design import nominal_mount
 from tomopose.planning.part.part import Part
@@ -15,6 +16,7 @@ from tomopose.planning.part.settings import PartSettings
 from tomopose.planning.part.targets import plane_normals, targets_of, tuy_points
 from tomopose.planning.part.worth import Goal, Views, table
 from tomopose.planning.part_scan.limits_file import ScanLimits
+from tomopose.planning.part_scan.robot_at_work import RobotAtWork, require_limits
 from tomopose.planning.part_scan.stations import Machine, stations
 from tomopose.units import Array
 
@@ -29,7 +31,7 @@ class Setting:
     features:    a measurement plan; without it the whole surface counts, by area.
     limits:      travel, times, obstacles; without them +-10 mm, +-5 deg and a table that turns freely.
     calibration: the mount, pivot and shared uncertainty; without it the paper's mount, R_z(180 deg).
-    manipulator: the hexapod whose legs have to stay within their stroke.
+    manipulator: the hexapod or robot whose legs or joints have to stay within their stroke.
     continuous:  whether the views lie on one smooth turn.
     """
 
@@ -40,23 +42,29 @@ class Setting:
     features: MeasurementPlan | None = None
     limits: ScanLimits = field(default_factory=ScanLimits)
     calibration: Calibration | None = None
-    manipulator: Hexapod | None = None
+    manipulator: Hexapod | SerialRobot | None = None
     continuous: bool = False
 
     def __post_init__(self) -> None:
+        if isinstance(self.manipulator, SerialRobot):
+            require_limits(self.manipulator)
         if self.views < 1:
             raise InputError(f"{self.views} views are wanted; a scan has at least one")
 
     @property
     def machine(self) -> Machine:
-        cal = self.calibration
+        cal, given = self.calibration, self.manipulator
+        mount = None if cal is None else cal.T_HT
+        machine = RobotAtWork(robot=given, mount=mount) if isinstance(given, SerialRobot) else given
+        if isinstance(machine, RobotAtWork):
+            mount = machine.T_HT
         return Machine(
             scanner=self.scanner,
-            T_HT=nominal_mount() if cal is None else cal.T_HT,
+            T_HT=nominal_mount() if mount is None else mount,
             limits=self.limits.travel,
             obstacles=self.limits.obstacles,
             pivot=None if cal is None else cal.pivot,
-            manipulator=self.manipulator,
+            manipulator=machine,
         )
 
     def candidates(self, goal: Goal) -> tuple[Array, Views]:

@@ -17,12 +17,15 @@ from tomopose.manipulator.poses import PoseSequence
 from tomopose.planning.part.keep_out import Obstacle, hits
 from tomopose.planning.part.part import Part
 from tomopose.planning.part.settings import PartSettings
+from tomopose.planning.part_scan.robot_at_work import RobotAtWork
 from tomopose.trajectory.feasibility import AXES, TravelLimits, in_view
 from tomopose.units import Array
 
 FULL_TURN = 2 * np.pi
 LIFTS = 3
 """Heights of the plate among the candidates where it can move by more than a millimetre."""
+UPRIGHT = 0.98
+"""Cosine of the angle between the plate's z and the table's axis, from which rz counts as a turn about that axis."""
 CORNER = np.sqrt(2.0)
 """Both tilt axes together reach farther than each: to the corner of their box."""
 
@@ -32,7 +35,8 @@ class Machine:
     """What moves the part, and within what.
 
     limits: x, y, z mm, angles of R_x R_y R_z and table, rad; a table interval of 360 deg or more turns freely.
-    pivot:  of the manipulator, as `PoseSequence` has it;  manipulator: whose legs have to stay within their stroke.
+    pivot:  of the manipulator, as `PoseSequence` has it;  manipulator: whose legs or joints have to stay within their
+    stroke.  Of a robot, axes are counted from its working pose, along those of W, and T_HT is that of `RobotAtWork`.
     """
 
     scanner: Scanner
@@ -40,7 +44,7 @@ class Machine:
     limits: TravelLimits
     obstacles: tuple[Obstacle, ...] = ()
     pivot: Array | None = None
-    manipulator: Hexapod | None = None
+    manipulator: Hexapod | RobotAtWork | None = None
 
     @property
     def turns_freely(self) -> bool:
@@ -66,6 +70,38 @@ class Machine:
             source="set",
         )
 
+    def commanded(self, q: Array) -> PoseSequence:
+        """What the controller is told for axes (n, 7): of a robot the poses in its base, with joint values."""
+        found = self.poses(q)
+        if not isinstance(self.manipulator, RobotAtWork):
+            return found
+        R, t = found.T_MH.R, found.T_MH.t
+        return PoseSequence(
+            T_MH=self.manipulator.commanded(R, t),
+            pose_id=found.pose_id,
+            alpha=found.alpha,
+            q=self.manipulator.joint_values(R, t)[0],
+            source="set",
+        )
+
+    @property
+    def home(self) -> RigidTransform | None:
+        """T_MH at which points of the part have their coordinates in W; None: the manipulator's zero."""
+        return self.manipulator.home if isinstance(self.manipulator, RobotAtWork) else None
+
+    @property
+    def joint_units(self) -> tuple[str, ...]:
+        """Of each joint of a robot, deg or mm."""
+        return self.manipulator.robot.joint_units if isinstance(self.manipulator, RobotAtWork) else ()
+
+    @property
+    def spin(self) -> tuple[float, float]:
+        """rad: by how much the plate can turn the part about the table's axis where the table cannot: rz."""
+        if self.turns_freely or abs(self.T_HT.R[2, 2]) < UPRIGHT:
+            return 0.0, 0.0
+        ends = np.sort(np.sign(self.T_HT.R[2, 2]) * np.array([self.limits.low[5], self.limits.high[5]]))
+        return float(ends[0]), float(ends[1])
+
     def matrices(self, q: Array) -> Array:
         """(n, 3, 4): points of the part at home, mm in W, to pixels.  Eq. (5)."""
         poses = self.poses(q)
@@ -80,8 +116,9 @@ def allowed(machine: Machine, part: Part, q: Array, *, margin: float) -> np.ndar
     seen = in_view(P, part.hull, n_u=machine.scanner.n_u, n_v=machine.scanner.n_v, margin=margin).all(axis=1)
     good &= seen
     if machine.manipulator is not None:
-        T_MH = machine.poses(q).T_MH
-        good &= machine.manipulator.reaches(T_MH.R, T_MH.t)
+        index = np.flatnonzero(good)
+        T_MH = machine.poses(q[index]).T_MH
+        good[index] = machine.manipulator.reaches(T_MH.R, T_MH.t)
     for obstacle in machine.obstacles:
         index = np.flatnonzero(good)
         good[index] &= ~hits(obstacle, part.hull, part.hull_planes, _motions(machine, q[index]))
@@ -96,18 +133,41 @@ def _motions(machine: Machine, q: Array) -> tuple[RigidTransform, RigidTransform
     )
 
 
-def tilted(machine: Machine, alpha: Array, tilt: Array, lift: Array, centre: Array) -> Array:
-    """Axes (n, 7) that tilt the part about y_W by `tilt`, rad, at table angles alpha, lifted by `lift`, mm.
+def turns(machine: Machine, step: float) -> Array:
+    """(n,) rad: even angles by which the part is turned about the table's axis, by the table and, where that cannot, by
+    the plate."""
+    low, high = machine.limits.low[6], machine.limits.high[6]
+    start = low if np.isfinite(low) else 0.0
+    if machine.turns_freely:
+        count = max(round(FULL_TURN / step), 1)
+        return np.asarray(start + np.arange(count) * FULL_TURN / count)
+    low, high = low + machine.spin[0], high + machine.spin[1]
+    whole, middle = high - low >= FULL_TURN * (1 - 1e-9), (low + high) / 2
+    width = FULL_TURN if whole else high - low
+    count = max(round(width / step), 1)
+    return np.asarray(middle + np.linspace(-width / 2, width / 2, count + 1)[: count if whole else None])
 
-    The plate moves so that the part's middle, `centre` (3,) mm in W at home, stays where it is.  rz keeps to the value
-    of its interval nearest to 0; then everything is drawn to the limits.
+
+def shared(machine: Machine, turn: Array) -> tuple[Array, Array]:
+    """(table angle, rz) (n,) rad of turns about the table's axis: the table takes what it can."""
+    alpha = turn if machine.turns_freely else np.clip(turn, machine.limits.low[6], machine.limits.high[6])
+    return alpha, np.sign(machine.T_HT.R[2, 2]) * (turn - alpha)
+
+
+def tilted(machine: Machine, turn: Array, tilt: Array, lift: Array, centre: Array) -> Array:
+    """Axes (n, 7) that turn the part by `turn`, rad, about the table's axis, tilt it about y_W by `tilt`, rad, and lift
+    it by `lift`, mm.
+
+    The plate moves so that the part's middle, `centre` (3,) mm in W at home, stays where it is.  Everything is drawn to
+    the limits.
     """
+    alpha, rz = shared(machine, turn)
     home = machine.scanner.T_TW(0.0) @ machine.T_HT
     T_TW = machine.scanner.T_TW(alpha)
     axis = np.einsum("nij,j->ni", np.swapaxes(T_TW.R @ machine.T_HT.R, 1, 2), [0.0, 1.0, 0.0])
     q = np.zeros((len(alpha), 7))
     q[:, 3:5] = tilt[:, None] * axis[:, :2]
-    q[:, 6] = alpha
+    q[:, 5], q[:, 6] = rz, alpha
     q = machine.clipped(q)
     c = home.inv.apply(centre)
     R = rotation_from_convention(np.degrees(q[:, 3:6]), "pi-hexapod")
@@ -116,22 +176,18 @@ def tilted(machine: Machine, alpha: Array, tilt: Array, lift: Array, centre: Arr
 
 
 def stations(machine: Machine, part: Part, settings: PartSettings) -> Array:
-    """Axes (n, 7) of all candidates: table angles x tilts about y_W x lifts, within everything that limits them.
+    """Axes (n, 7) of all candidates: turns x tilts about y_W x lifts, within everything that limits them.
 
     OutOfReachError, naming what blocks, where none is left.
     """
     low, high = machine.limits.low, machine.limits.high
-    width = min(high[6] - low[6], FULL_TURN) if np.isfinite(high[6] - low[6]) else FULL_TURN
-    start = low[6] if np.isfinite(low[6]) else 0.0
-    count = max(round(width / settings.alpha_step), 1)
-    turn = np.arange(count) * width / count if machine.turns_freely else np.linspace(0, width, count + 1)
     reach = CORNER * float(np.abs([low[3:5], high[3:5]]).max())
     if not np.isfinite(reach):
         raise InputError("limits: rx_deg and ry_deg need finite travel; without it no tilt is planned")
     steps = int(np.ceil(reach / settings.tilt_step - 1e-9)) if reach > 0 else 0
     tilt = np.linspace(-reach, reach, 2 * steps + 1)
     lift = np.linspace(low[2], high[2], LIFTS) if high[2] - low[2] > 1.0 else np.array([(low[2] + high[2]) / 2])
-    grid = np.stack(np.meshgrid(start + turn, tilt, lift, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid = np.stack(np.meshgrid(turns(machine, settings.alpha_step), tilt, lift, indexing="ij"), axis=-1).reshape(-1, 3)
     q = tilted(machine, grid[:, 0], grid[:, 1], grid[:, 2], part.centre)
     q = q[np.sort(np.unique(np.round(q, 9), axis=0, return_index=True)[1])]
     good = allowed(machine, part, q, margin=settings.margin)
@@ -155,7 +211,10 @@ def _what_blocks(machine: Machine, part: Part, q: Array, settings: PartSettings)
     if machine.manipulator is not None:
         T_MH = machine.poses(q).T_MH
         reached = machine.manipulator.reaches(T_MH.R, T_MH.t)
-        if not (seen & reached).any():
+        if seen.any() and not (seen & reached).any():
+            if isinstance(machine.manipulator, RobotAtWork):
+                why = machine.manipulator.what_blocks(T_MH.R[seen], T_MH.t[seen])
+                return f"no pose that keeps {part.name} in view is within the robot's reach: {why}"
             return (
                 f"the hexapod's legs leave their stroke in every pose that keeps {part.name} in view "
                 f"({int(reached.sum())} of {len(q)} poses are within it)"

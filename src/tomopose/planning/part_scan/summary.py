@@ -9,6 +9,7 @@ import numpy as np
 
 from tomopose.planning.part.settings import LIFT_MM, PLANES, WEIGHTS, PartSettings
 from tomopose.planning.part_scan.plan import Judged, PartScanPlan
+from tomopose.planning.part_scan.robot_at_work import RobotAtWork
 
 Content: TypeAlias = dict[str, object]
 
@@ -66,6 +67,20 @@ def _constants(s: PartSettings) -> Content:
     }
 
 
+def _joints(plan: PartScanPlan) -> list[Content] | None:
+    """How far each joint of a robot goes and may go; None for other machines."""
+    if not isinstance(plan.machine.manipulator, RobotAtWork) or plan.poses.q is None:
+        return None
+    out: list[Content] = []
+    for k, (unit, q) in enumerate(zip(plan.machine.joint_units, plan.poses.q.T, strict=True)):
+        low, high, *limits = (
+            float(np.degrees(x)) if unit == "deg" else float(x)
+            for x in (q.min(), q.max(), *plan.machine.manipulator.limits[:, k])
+        )
+        out.append({"joint": k + 1, "unit": unit, "lowest": low, "highest": high, "limits": limits})
+    return out
+
+
 def plan_document(plan: PartScanPlan) -> Content:
     """What scan.json holds: figures of the plan and of the usual paths, certificate, what stays unseen, constants."""
     limits = plan.machine.limits
@@ -90,6 +105,8 @@ def plan_document(plan: PartScanPlan) -> Content:
         "continuous": plan.way is not None,
         "way": None if plan.way is None else {"places": len(plan.way), "places_not_allowed": plan.way_blocked},
         "transmission_by_view": plan.chosen.tau.tolist(),
+        "joints": _joints(plan),
+        "home": None if plan.machine.home is None else plan.machine.home.matrix.tolist(),
         "limits": {name: bounds[:, k].tolist() for k, name in enumerate(names)},
         "assumed_limits": list(plan.limits.assumed),
         "constants": _constants(plan.settings),

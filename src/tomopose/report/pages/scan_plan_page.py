@@ -65,6 +65,17 @@ class ScanPlanFigures(PathFigures):
     constants: dict[str, object]
     attenuation: str
     freedoms: list[Freedom]
+    joints: list[Joint] | None
+
+
+class Joint(TypedDict):
+    """How far a joint of a robot goes, and what it may."""
+
+    joint: int
+    unit: str
+    lowest: float
+    highest: float
+    limits: list[float]
 
 
 class Freedom(TypedDict):
@@ -295,6 +306,13 @@ def _limits(document: ScanPlanFigures) -> list[Block]:
 def _constants(document: ScanPlanFigures) -> Table:
     rows = [["attenuation", document["attenuation"]], *([k, str(v)] for k, v in document["constants"].items())]
     rows += [[k, f"{v[0]:g} to {v[1]:g}"] for k, v in document["limits"].items()]
+    rows += [
+        [
+            f"joint {j['joint']}, {j['unit']}",
+            "{:.4g} to {:.4g} of {:g} to {:g}".format(j["lowest"], j["highest"], *j["limits"]),
+        ]
+        for j in document["joints"] or ()
+    ]
     if document["assumed_limits"]:
         rows.append(["limits not given, defaults taken", ", ".join(document["assumed_limits"])])
     return Table(
