@@ -14,6 +14,7 @@ import tomopose as tp
 from tomopose.cli.main import run
 from tomopose.cli.plan_scan import PartOptions
 from tomopose.io.foreign.reading import read_pose_log
+from tomopose.manipulator.files import write_manipulator
 from tomopose.manipulator.virtual import typical_robot
 from tomopose.planning.part.settings import PartSettings
 
@@ -124,7 +125,7 @@ def test_a_robots_plan_holds_its_joint_values_and_their_strokes(words, tmp_path)
     asked = [*words, "--mu-per-mm", "0.05", "--views", "4", "--manipulator", str(tmp_path / "robot.json")]
     joints = [replace(j, limits=(q - 0.4, q + 0.4)) for j, q in zip(robot.joints, robot.q_start.tolist(), strict=True)]
     robot = replace(robot, joints=joints)
-    tp.write_manipulator(tmp_path / "robot.json", robot)
+    write_manipulator(tmp_path / "robot.json", robot)
     assert run([*asked, "--commands", "kuka-krl"]) == 0
     poses = tp.read_poses(tmp_path / "scan.csv")
     assert (np.abs(poses.q - robot.q_start) <= 0.4).all()
