@@ -178,7 +178,7 @@ def test_a_manipulator_without_known_strokes_is_refused(words, tmp_path, capsys)
     plates = {"base_joints_mm": ring.tolist(), "platform_joints_mm": (0.6 * ring).tolist()}
     for content, match in (
         ({"schema": "tomopose/hexapod/1", **plates}, "leg_limits_mm is missing"),
-        ({"schema": "tomopose/serial/1", "convention": "dh", "joints": [joints] * 6}, "joint 1 of the robot has no limits_deg"),
+        ({"schema": "tomopose/serial/1", "convention": "dh", "joints": [joints] * 6}, "joint 1 of the robot has no"),
     ):
         (tmp_path / "machine.json").write_text(json.dumps(content))
         assert run([*words, "--mu-per-mm", "0.05", "--manipulator", str(tmp_path / "machine.json")]) == 1
