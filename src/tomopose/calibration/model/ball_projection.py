@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numba import njit
@@ -25,7 +25,6 @@ from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
 
-Two: TypeAlias = tuple[float, float]
 Three: TypeAlias = tuple[float, float, float]
 
 SCANNER_COLUMNS = (
@@ -48,10 +47,8 @@ SCANNER_COLUMNS = (
 `translation_scale` (nominal 1) multiplies the translations t_MH that the manipulator reports.
 """
 
-YES: Any
-NO: Any
-YES, NO = np.bool_(True), np.bool_(False)
-"""numba compiles a function once more for a plain True or False that it is called with, not for these."""
+INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+"""Of a function that only compiled code calls: a fifth of the time to compile it goes into being called by Python."""
 
 
 def scanner_vector(scanner: Scanner, translation_scale: float = 1.0) -> Array:
@@ -59,208 +56,179 @@ def scanner_vector(scanner: Scanner, translation_scale: float = 1.0) -> Array:
     return np.array([*(getattr(scanner, name) for name in SCANNER_COLUMNS[:-1]), translation_scale])
 
 
-@njit(cache=True, inline="always")
-def _panel(s: Array, R: Array) -> None:
-    """R = R_x(theta) R_y(phi) R_z(eta), written into R."""
-    ce, se = math.cos(s[6]), math.sin(s[6])
-    ct, st = math.cos(s[7]), math.sin(s[7])
-    cp, sp = math.cos(s[8]), math.sin(s[8])
-    R[0, 0], R[0, 1], R[0, 2] = cp * ce, -cp * se, sp
-    R[1, 0], R[1, 1], R[1, 2] = ct * se + st * sp * ce, ct * ce - st * sp * se, -st * cp
-    R[2, 0], R[2, 1], R[2, 2] = st * se - ct * sp * ce, st * ce + ct * sp * se, ct * cp
+@njit(cache=True, **INNER)
+def view_of(v: Array, r: int) -> None:
+    """Row r of v (runs, 29): what all poses of a run have in common, from its scanner vector, the first 13 numbers.
 
-
-@njit(cache=True, inline="always")
-def _table(s: Array, alpha: float, M: Array) -> None:
-    """The rotation of the table about its real axis, written into M."""
-    c, d = math.cos(alpha), math.sin(alpha)
-    if s[10] == 0.0 and s[11] == 0.0:
-        M[0, 0], M[0, 1], M[0, 2] = c, -d, 0.0
-        M[1, 0], M[1, 1], M[1, 2] = d, c, 0.0
-        M[2, 0], M[2, 1], M[2, 2] = 0.0, 0.0, 1.0
-        return
-    # Rodrigues about a = R_x(tilt_x) R_y(tilt_y) e_z
-    a0 = math.sin(s[11])
-    a1, a2 = -math.sin(s[10]) * math.cos(s[11]), math.cos(s[10]) * math.cos(s[11])
-    k = 1.0 - c
-    M[0, 0], M[0, 1], M[0, 2] = c + k * a0 * a0, k * a0 * a1 - d * a2, k * a0 * a2 + d * a1
-    M[1, 0], M[1, 1], M[1, 2] = k * a1 * a0 + d * a2, c + k * a1 * a1, k * a1 * a2 - d * a0
-    M[2, 0], M[2, 1], M[2, 2] = k * a2 * a0 - d * a1, k * a2 * a1 + d * a0, c + k * a2 * a2
-
-
-class Projected(NamedTuple):
-    """Where one pose's projection and its derivatives are written.
-
-    x (2,) px;  x_H (3,), y_T = R_HT x_H (3,) mm;  G_H = dx/dx_H, G_T = dx/dx_T (2, 3);  J_s (2, 13) by SCANNER_COLUMNS;
-    R, M (3, 3): work space for the rotations of panel and table.
+    Then the panel's rotation R_x(theta) R_y(phi) R_z(eta) by rows, cos and sin of theta, the table's real axis
+    R_x(tilt_x) R_y(tilt_y) e_z, and cos and sin of tilt_x.
     """
+    ce, se = math.cos(v[r, 6]), math.sin(v[r, 6])
+    ct, st = math.cos(v[r, 7]), math.sin(v[r, 7])
+    cp, sp = math.cos(v[r, 8]), math.sin(v[r, 8])
+    cx, sx, cy = math.cos(v[r, 10]), math.sin(v[r, 10]), math.cos(v[r, 11])
+    v[r, 13], v[r, 14], v[r, 15] = cp * ce, -cp * se, sp
+    v[r, 16], v[r, 17], v[r, 18] = ct * se + st * sp * ce, ct * ce - st * sp * se, -st * cp
+    v[r, 19], v[r, 20], v[r, 21] = st * se - ct * sp * ce, st * ce + ct * sp * se, ct * cp
+    v[r, 22], v[r, 23] = ct, st
+    v[r, 24], v[r, 25], v[r, 26] = math.sin(v[r, 11]), -sx * cy, cx * cy
+    v[r, 27], v[r, 28] = cx, sx
 
-    x: Array
-    x_H: Array
-    y_T: Array
-    G_H: Array
-    G_T: Array
-    J_s: Array
-    R: Array
-    M: Array
+
+VIEW = 29
+"""Numbers of `view_of`."""
 
 
-@njit(cache=True, error_model="numpy")
-def project_pose(
-    s: Array,
-    R_HT: Array,
-    t_HT: Array,
-    R_k: Array,
-    t_k: Array,
-    t: Array,
-    alpha: float,
-    derivatives: bool,
-    out: Projected,
-) -> bool:
-    """One pose, written into `out`; without `derivatives` only x, x_H and y_T.
+POSE = 14
+"""Numbers of a pose: R_MH by rows, t_MH, cos and sin of the table's angle."""
 
-    False where the ball is not in front of the source.
+CENTRE, MOVES, EVERYTHING = range(3)
+"""What `project_pose` writes: x, x_H and y_T; the derivatives by the place of the ball too; by the scanner too."""
+
+X, X_H, Y_T, G_T, G_H, J_S, PROJECTED = 0, 2, 5, 8, 14, 20, 46
+"""Where `project_pose` writes x (2) px; x_H (3), y_T = R_HT x_H (3) mm; dx/dx_T and dx/dx_H (2, 3); derivatives (2, 13)
+by SCANNER_COLUMNS, and how many numbers these are."""
+
+
+BALLS = 12
+"""Where the balls begin in a point: R_HT by rows, t_HT, then the balls (3 each)."""
+
+
+@njit(cache=True, error_model="numpy", **INNER)
+def project_pose(v: Array, at: Array, poses: Array, index: tuple[int, int, int], wanted: int, out: Array) -> bool:
+    """One pose, written into `out` (46,); False where the ball is not in front of the source.
+
+    v (runs, 29): as of `view_of`;  at: see BALLS;  poses (n, 14);  index: run, pose and ball;  wanted: see CENTRE.
+    Whole arrays and an index, since every view of an array costs two counts of references.
     """
-    x, x_H, y_T, G_H, G_T, J_s, R, M = out
-    scale = s[12]
-    _panel(s, R)
-    _table(s, alpha, M)
+    r, k, ball = index
+    t0, t1, t2, scale = at[BALLS + 3 * ball], at[BALLS + 3 * ball + 1], at[BALLS + 3 * ball + 2], v[r, 12]
     for i in range(3):
-        x_H[i] = R_k[i, 0] * t[0] + R_k[i, 1] * t[1] + R_k[i, 2] * t[2] + scale * t_k[i]
+        R_t = poses[k, 3 * i] * t0 + poses[k, 3 * i + 1] * t1 + poses[k, 3 * i + 2] * t2
+        out[X_H + i] = R_t + scale * poses[k, 9 + i]
+    h0, h1, h2 = out[X_H], out[X_H + 1], out[X_H + 2]
     for i in range(3):
-        y_T[i] = R_HT[i, 0] * x_H[0] + R_HT[i, 1] * x_H[1] + R_HT[i, 2] * x_H[2]
-    z0, z1, z2 = y_T[0] + t_HT[0], y_T[1] + t_HT[1] - s[9], y_T[2] + t_HT[2]
-    m0 = M[0, 0] * z0 + M[0, 1] * z1 + M[0, 2] * z2
-    m1 = M[1, 0] * z0 + M[1, 1] * z1 + M[1, 2] * z2
-    m2 = M[2, 0] * z0 + M[2, 1] * z1 + M[2, 2] * z2
-    X, Y, Z = -(m1 + s[9]), m2, s[1] - m0
-    y0 = R[0, 0] * X + R[1, 0] * Y + R[2, 0] * Z
-    y1 = R[0, 1] * X + R[1, 1] * Y + R[2, 1] * Z
-    y2 = R[0, 2] * X + R[1, 2] * Y + R[2, 2] * Z
+        out[Y_T + i] = at[3 * i] * h0 + at[3 * i + 1] * h1 + at[3 * i + 2] * h2
+    # the table turns by Rodrigues' formula about its axis
+    c, d, a0, a1, a2 = poses[k, 12], poses[k, 13], v[r, 24], v[r, 25], v[r, 26]
+    k0, k1, k2 = (1.0 - c) * a0, (1.0 - c) * a1, (1.0 - c) * a2
+    M0 = (c + k0 * a0, k0 * a1 - d * a2, k0 * a2 + d * a1)
+    M1 = (k1 * a0 + d * a2, c + k1 * a1, k1 * a2 - d * a0)
+    M2 = (k2 * a0 - d * a1, k2 * a1 + d * a0, c + k2 * a2)
+    z0, z1, z2 = out[Y_T] + at[9], out[Y_T + 1] + at[10] - v[r, 9], out[Y_T + 2] + at[11]
+    m0 = M0[0] * z0 + M0[1] * z1 + M0[2] * z2
+    m1 = M1[0] * z0 + M1[1] * z1 + M1[2] * z2
+    m2 = M2[0] * z0 + M2[1] * z1 + M2[2] * z2
+    s0, s1, s2 = -(m1 + v[r, 9]), m2, v[r, 1] - m0
+    R0, R1, R2 = (v[r, 13], v[r, 14], v[r, 15]), (v[r, 16], v[r, 17], v[r, 18]), (v[r, 19], v[r, 20], v[r, 21])
+    y2 = R0[2] * s0 + R1[2] * s1 + R2[2] * s2
     if not y2 > 0.0:
         return False
-    f_u, f_v, r = -s[0] / s[2], s[0] / s[3], R[2, 2]
-    a, b = y0 / y2, y1 / y2
-    du, dv = f_u * (r * a - R[2, 0]), f_v * (r * b - R[2, 1])
-    x[0], x[1] = s[4] + du, s[5] + dv
-    if not derivatives:
+    f_u, f_v = -v[r, 0] / v[r, 2], v[r, 0] / v[r, 3]
+    a, b = (R0[0] * s0 + R1[0] * s1 + R2[0] * s2) / y2, (R0[1] * s0 + R1[1] * s1 + R2[1] * s2) / y2
+    du, dv = f_u * (R2[2] * a - R2[0]), f_v * (R2[2] * b - R2[1])
+    out[X], out[X + 1] = v[r, 4] + du, v[r, 5] + dv
+    if wanted == CENTRE:
         return True
-    # dx/dx_S
-    gu, gv = f_u * r / y2, f_v * r / y2
-    su0, su1, su2 = gu * (R[0, 0] - a * R[0, 2]), gu * (R[1, 0] - a * R[1, 2]), gu * (R[2, 0] - a * R[2, 2])
-    sv0, sv1, sv2 = gv * (R[0, 1] - b * R[0, 2]), gv * (R[1, 1] - b * R[1, 2]), gv * (R[2, 1] - b * R[2, 2])
-    # dx/dx_W = dx/dx_S R_WS
-    wu, wv = (-su2, -su0, su1), (-sv2, -sv0, sv1)
-    for i in range(3):
-        G_T[0, i] = wu[0] * M[0, i] + wu[1] * M[1, i] + wu[2] * M[2, i]
-        G_T[1, i] = wv[0] * M[0, i] + wv[1] * M[1, i] + wv[2] * M[2, i]
-    for i in range(3):
-        G_H[0, i] = G_T[0, 0] * R_HT[0, i] + G_T[0, 1] * R_HT[1, i] + G_T[0, 2] * R_HT[2, i]
-        G_H[1, i] = G_T[1, 0] * R_HT[0, i] + G_T[1, 1] * R_HT[1, i] + G_T[1, 2] * R_HT[2, i]
-    J_s[0, 0], J_s[1, 0] = du / s[0], dv / s[0]
-    J_s[0, 1], J_s[1, 1] = su2, sv2
-    J_s[0, 2], J_s[1, 2] = -du / s[2], 0.0
-    J_s[0, 3], J_s[1, 3] = 0.0, -dv / s[3]
-    J_s[0, 4], J_s[1, 4] = 1.0, 0.0
-    J_s[0, 5], J_s[1, 5] = 0.0, 1.0
-    _by_panel_angles(s[7], R, (X, Y, Z), (su0, su1, su2), (sv0, sv1, sv2), (f_u, a), (f_v, b), J_s)
-    _by_table_axis(s[10], (z0, z1, z2), (m0, m1, m2), wu, wv, G_T, J_s)
-    J_s[0, 12] = G_H[0, 0] * t_k[0] + G_H[0, 1] * t_k[1] + G_H[0, 2] * t_k[2]
-    J_s[1, 12] = G_H[1, 0] * t_k[0] + G_H[1, 1] * t_k[1] + G_H[1, 2] * t_k[2]
+    # dx/dx_S, and dx/dx_W = dx/dx_S R_WS
+    gu, gv = f_u * R2[2] / y2, f_v * R2[2] / y2
+    su = (gu * (R0[0] - a * R0[2]), gu * (R1[0] - a * R1[2]), gu * (R2[0] - a * R2[2]))
+    sv = (gv * (R0[1] - b * R0[2]), gv * (R1[1] - b * R1[2]), gv * (R2[1] - b * R2[2]))
+    for e in range(2):
+        w = su if e == 0 else sv
+        g0 = w[1] * M2[0] - w[2] * M0[0] - w[0] * M1[0]
+        g1 = w[1] * M2[1] - w[2] * M0[1] - w[0] * M1[1]
+        g2 = w[1] * M2[2] - w[2] * M0[2] - w[0] * M1[2]
+        G = G_T + 3 * e
+        out[G], out[G + 1], out[G + 2] = g0, g1, g2
+        for i in range(3):
+            out[G_H + 3 * e + i] = g0 * at[i] + g1 * at[3 + i] + g2 * at[6 + i]
+        if wanted == EVERYTHING:
+            f, q, off = (f_u, a, du) if e == 0 else (f_v, b, dv)
+            J = J_S + 13 * e
+            out[J], out[J + 1] = off / v[r, 0], w[2]
+            out[J + 2 + e], out[J + 3 - e] = -off / v[r, 2 + e], 0.0
+            out[J + 4 + e], out[J + 5 - e] = 1.0, 0.0
+            _by_panel_angles(v, r, (s0, s1, s2), w, f, q, e, out)
+            _by_table_axis(v, r, (z0, z1, z2), (m0, m1, m2), (-w[2], -w[0], w[1]), (g0, g1, g2), J, out)
+            H = G_H + 3 * e
+            out[J + 12] = out[H] * poses[k, 9] + out[H + 1] * poses[k, 10] + out[H + 2] * poses[k, 11]
     return True
 
 
-@njit(cache=True, inline="always")
-def _by_panel_angles(
-    theta: float, R: Array, x_S: Three, su: Three, sv: Three, u: Two, v: Two, J_s: Array
-) -> None:  # fmt: skip
-    """Columns eta, theta, phi of J_s: dR = [n]_x R with n = R e_z, e_x, R_x(theta) e_y; dy = R^T (x_S x n).
+@njit(cache=True, **INNER)
+def _by_panel_angles(v: Array, r: int, x_S: Three, w: Three, f: float, q: float, e: int, out: Array) -> None:
+    """Columns eta, theta, phi, of row e: dR = [n]_x R with n = R e_z, e_x, R_x(theta) e_y; dy = R^T (x_S x n).
 
-    su, sv: dx/dx_S;  u, v: (f_u, y_1 / y_3), (f_v, y_2 / y_3).
+    w: dx/dx_S;  f, q: (f_u, y_1 / y_3), or (f_v, y_2 / y_3).
     """
-    X, Y, Z = x_S
+    s0, s1, s2 = x_S
     for k in range(3):
-        if k == 0:
-            n0, n1, n2 = R[0, 2], R[1, 2], R[2, 2]
-        elif k == 1:
-            n0, n1, n2 = 1.0, 0.0, 0.0
-        else:
-            n0, n1, n2 = 0.0, math.cos(theta), math.sin(theta)
-        c0, c1, c2 = Y * n2 - Z * n1, Z * n0 - X * n2, X * n1 - Y * n0
+        n0 = v[r, 15] if k == 0 else 1.0 if k == 1 else 0.0
+        n1 = v[r, 18] if k == 0 else 0.0 if k == 1 else v[r, 22]
+        n2 = v[r, 21] if k == 0 else 0.0 if k == 1 else v[r, 23]
+        c0, c1, c2 = s1 * n2 - s2 * n1, s2 * n0 - s0 * n2, s0 * n1 - s1 * n0
         # row 3 of [n]_x R
-        r0, r1, r2 = n0 * R[1, 0] - n1 * R[0, 0], n0 * R[1, 1] - n1 * R[0, 1], n0 * R[1, 2] - n1 * R[0, 2]
-        J_s[0, 6 + k] = su[0] * c0 + su[1] * c1 + su[2] * c2 + u[0] * (r2 * u[1] - r0)
-        J_s[1, 6 + k] = sv[0] * c0 + sv[1] * c1 + sv[2] * c2 + v[0] * (r2 * v[1] - r1)
+        r_e, r_2 = n0 * v[r, 16 + e] - n1 * v[r, 13 + e], n0 * v[r, 18] - n1 * v[r, 15]
+        out[J_S + 13 * e + 6 + k] = w[0] * c0 + w[1] * c1 + w[2] * c2 + f * (r_2 * q - r_e)
 
 
-@njit(cache=True, inline="always")
-def _by_table_axis(tilt_x: float, z: Three, m: Three, wu: Three, wv: Three, G_T: Array, J_s: Array) -> None:
-    """Columns axis_y, axis_tilt_x, axis_tilt_y of J_s: x_W = M z + o with o = (0, axis_y, 0), z = x_T - o, m = M z.
+@njit(cache=True, **INNER)
+def _by_table_axis(v: Array, r: int, z: Three, m: Three, w: Three, g: Three, J: int, out: Array) -> None:
+    """Columns axis_y, axis_tilt_x, axis_tilt_y of the row that begins at J: x_W = M z + o with o = (0, axis_y, 0),
+    z = x_T - o, m = M z.
 
-    wu, wv: dx/dx_W.  dM = [c]_x M - M [c]_x with c = e_x, then R_x(tilt_x) e_y.
+    w, g: dx/dx_W, dx/dx_T.  dM = [c]_x M - M [c]_x with c = e_x, then R_x(tilt_x) e_y.
     """
-    J_s[0, 9] = wu[1] - G_T[0, 1]
-    J_s[1, 9] = wv[1] - G_T[1, 1]
+    out[J + 9] = w[1] - g[1]
     for k in range(2):
-        c0 = 1.0 if k == 0 else 0.0
-        c1 = 0.0 if k == 0 else math.cos(tilt_x)
-        c2 = 0.0 if k == 0 else math.sin(tilt_x)
-        p0, p1, p2 = c1 * m[2] - c2 * m[1], c2 * m[0] - c0 * m[2], c0 * m[1] - c1 * m[0]
-        q0, q1, q2 = c1 * z[2] - c2 * z[1], c2 * z[0] - c0 * z[2], c0 * z[1] - c1 * z[0]
-        J_s[0, 10 + k] = wu[0] * p0 + wu[1] * p1 + wu[2] * p2 - G_T[0, 0] * q0 - G_T[0, 1] * q1 - G_T[0, 2] * q2
-        J_s[1, 10 + k] = wv[0] * p0 + wv[1] * p1 + wv[2] * p2 - G_T[1, 0] * q0 - G_T[1, 1] * q1 - G_T[1, 2] * q2
+        c0, c1, c2 = (1.0, 0.0, 0.0) if k == 0 else (0.0, v[r, 27], v[r, 28])
+        p = w[0] * (c1 * m[2] - c2 * m[1]) + w[1] * (c2 * m[0] - c0 * m[2]) + w[2] * (c0 * m[1] - c1 * m[0])
+        q = g[0] * (c1 * z[2] - c2 * z[1]) + g[1] * (c2 * z[0] - c0 * z[2]) + g[2] * (c0 * z[1] - c1 * z[0])
+        out[J + 10 + k] = p - q
 
 
 @njit(cache=True, error_model="numpy")
-def _project_all(
-    s: Array,
-    run: Any,
-    R_HT: Array,
-    t_HT: Array,
-    R_k: Array,
-    t_k: Array,
-    t: Array,
-    alpha: Array,
-    derivatives: bool,
-    found: Projected,
-    J_w: Array,
-) -> None:
-    """found: x (n, 2), x_H, y_T (n, 3), G_H, G_T (n, 2, 3), J_s (n, 2, 13) of every pose, R, M (3, 3); J_w (n, 2, 3) =
-    y_T x G_T, by a turn of the mount.
+def _project_all(s: Array, run: Any, at: Array, poses: Array, wanted: int, found: Array, x: Array) -> None:
+    """x (n, 2): the centres, left as they are where a ball is behind the source;  found (n, 46): see X, of which one
+    row is enough where only the CENTRE is wanted.
 
-    Without `derivatives` one row of each array but x is enough.
+    s (runs, 13), run (n,), poses (n, 14);  at: see BALLS, one ball a pose.
     """
-    x, x_H, y_T, G_H, G_T, J_s, R, M = found
-    for k in range(R_k.shape[0]):
-        i = k if derivatives else 0
-        out = Projected(x[k], x_H[i], y_T[i], G_H[i], G_T[i], J_s[i], R, M)
-        project_pose(s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[k], alpha[k], derivatives, out)
-        for m in range(6 if derivatives else 0):
-            e, j, a, b = m // 3, m % 3, (m + 1) % 3, (m + 2) % 3
-            J_w[k, e, j] = y_T[i, a] * G_T[i, e, b] - y_T[i, b] * G_T[i, e, a]
+    views = np.empty((s.shape[0], VIEW))
+    for r in range(s.shape[0]):
+        for i in range(s.shape[1]):
+            views[r, i] = s[r, i]
+        view_of(views, r)
+    for k in range(poses.shape[0]):
+        out = found[k if wanted else 0]
+        if project_pose(views, at, poses, (run[k], k, k), wanted, out):
+            x[k, 0], x[k, 1] = out[X], out[X + 1]
 
 
-def _space(n: int) -> Projected:
-    """Arrays that `_project_all` writes n poses into: those that compiled code makes are slow to take over."""
-    return Projected(
-        x=np.full((n, 2), np.nan), x_H=np.empty((n, 3)), y_T=np.empty((n, 3)), G_H=np.zeros((n, 2, 3)),
-        G_T=np.zeros((n, 2, 3)), J_s=np.zeros((n, 2, 13)), R=np.empty((3, 3)), M=np.empty((3, 3)),
-    )  # fmt: skip
+def point_of(R_HT: Array, t_HT: Array, *rest: Array) -> Array:
+    """(12 + k,): a mount and k more numbers, as `project_pose` takes them; see BALLS."""
+    return np.concatenate([R_HT.ravel(), t_HT, *(x.ravel() for x in rest)])
 
 
-def projected_centres(
-    s: Array, run: Any, R_HT: Array, t_HT: Array, R_MH: Array, t_MH: Array, t: Array, alpha: Array
-) -> Array:
+def poses_of(R_MH: Array, t_MH: Array, alpha: Array) -> Array:
+    """(n, 14): R_MH (n, 3, 3), t_MH (n, 3) and table angles alpha (n,), as `project_pose` takes them."""
+    poses = np.empty((len(R_MH), POSE))
+    poses[:, :9], poses[:, 9:12] = R_MH.reshape(-1, 9), t_MH
+    np.cos(alpha, out=poses[:, 12])
+    np.sin(alpha, out=poses[:, 13])
+    return poses
+
+
+def projected_centres(s: Array, run: Any, R_HT: Array, t_HT: Array, poses: Array, t: Array) -> Array:
     """(n, 2) px: eq. (6) without derivatives; NaN where a ball is behind the source.
 
-    s (runs, 13): `scanner_vector` of each run;  run: (n,) integers;  R_HT (3, 3), t_HT (3,);  R_MH (n, 3, 3), t_MH (n,
-    3): the poses;  t: (n, 3) ball centres in M, mm;  alpha: (n,) rad.
+    s (runs, 13): `scanner_vector` of each run;  run: (n,) integers;  R_HT (3, 3), t_HT (3,);  poses (n, 14): as of
+    `poses_of`;  t: (n, 3) ball centres in M, mm.
     """
-    found = _space(1)._replace(x=np.full((len(R_MH), 2), np.nan))
-    given = (R_HT, t_HT, R_MH, t_MH, t, alpha)
-    R_HT, t_HT, R_MH, t_MH, t, alpha = (np.ascontiguousarray(v, dtype=np.float64) for v in given)
-    _project_all(s, run, R_HT, t_HT, R_MH, t_MH, t, alpha, NO, found, np.empty((1, 2, 3)))
-    return found.x
+    x = np.full((len(poses), 2), np.nan)
+    _project_all(s, run, point_of(R_HT, t_HT, t), poses, CENTRE, np.empty((1, PROJECTED)), x)
+    return x
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -322,15 +290,16 @@ def projection_blocks(
     scanners = [scanner] if isinstance(scanner, Scanner) else list(scanner)
     s = np.array([scanner_vector(one, translation_scale) for one in scanners])
     n = len(T_MH)
-    given = (T_HT.R, T_HT.t, T_MH.R, T_MH.t, np.broadcast_to(t, (n, 3)), np.broadcast_to(alpha, (n,)))
     # Copies: contiguous and writable, whatever was given, so that the kernel is compiled for one kind of array.
-    R_HT, t_HT, R_MH, t_MH, t_k, angle = (np.array(x, dtype=np.float64, order="C") for x in given)
+    R_MH, t_k = (np.array(x, dtype=np.float64, order="C") for x in (T_MH.R, np.broadcast_to(t, (n, 3))))
+    poses = poses_of(R_MH, T_MH.t, np.broadcast_to(np.asarray(alpha, dtype=np.float64), (n,)))
     index = np.zeros(n, dtype=np.int64) if run is None else np.array(run, dtype=np.int64)
-    b, J_w = _space(n), np.zeros((n, 2, 3))
-    _project_all(s, index, R_HT, t_HT, R_MH, t_MH, t_k, angle, YES, b, J_w)
+    x, b = np.full((n, 2), np.nan), np.zeros((n, PROJECTED))
+    _project_all(s, index, point_of(T_HT.R, T_HT.t, t_k), poses, EVERYTHING, b, x)
+    by_T, by_H = (b[:, first : first + 6].reshape(n, 2, 3) for first in (G_T, G_H))
     return ProjectionBlocks(
-        x_D=b.x, J_w_HT=J_w, J_t_HT=b.G_T, J_t=b.G_H @ R_MH, J_scanner=b.J_s, x_H=b.x_H, t=t_k,
-        R_MH=R_MH, G_H=b.G_H,
+        x_D=x, J_w_HT=np.cross(b[:, None, Y_T : Y_T + 3], by_T), J_t_HT=by_T, J_t=by_H @ R_MH,
+        J_scanner=b[:, J_S:].reshape(n, 2, 13), x_H=b[:, X_H : X_H + 3].copy(), t=t_k, R_MH=R_MH, G_H=by_H,
     )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from tomopose.calibration.model.ball_projection import scanner_vector, whiteners
+from tomopose.calibration.model.ball_projection import poses_of, scanner_vector, whiteners
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import rotation_angle_between, rotation_from_convention
@@ -84,6 +84,11 @@ class Problem:
     def s_0(self) -> Array:
         """(runs, 13) scanner vectors at nominal values."""
         return np.array([scanner_vector(s) for s in self.scanners])
+
+    @functools.cached_property
+    def poses(self) -> Array:
+        """(n, 14): the poses as compiled code takes them."""
+        return poses_of(self.R_MH, self.t_MH, self.alpha)
 
     @functools.cached_property
     def T_MH(self) -> RigidTransform:

@@ -6,11 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tomopose.calibration.model.ball_projection import ProjectionBlocks, projected_centres, projection_blocks
+from tomopose.calibration.model.ball_projection import (
+    BALLS,
+    ProjectionBlocks,
+    point_of,
+    projected_centres,
+    projection_blocks,
+)
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, translation_scale
 from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.rigid.kernel import Freed, Point, Rows, levenberg_marquardt, scanner_vectors
+from tomopose.calibration.rigid.kernel import Freed, Rows, levenberg_marquardt, scanner_vectors
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.least_squares import CODES, Status
@@ -48,9 +54,7 @@ def rows_of(problem: Problem, weight: Array | None = None) -> Rows:
         x=problem.x_D,
         W=problem.W,
         weight=w,
-        R=problem.R_MH,
-        t=problem.t_MH,
-        alpha=problem.alpha,
+        poses=problem.poses,
         run=problem.run,
         ball=problem.ball,
     )
@@ -73,17 +77,16 @@ def minimise(
 ) -> Fit:
     """The optimum reached from a start (a fit, or R_HT, t_HT, t), with weights (n,) on the squared residuals."""
     R, t_HT, t = (start.R_HT, start.t_HT, start.t) if isinstance(start, Fit) else start
-    delta = start.delta.copy() if isinstance(start, Fit) and len(start.delta) == len(free) else np.zeros(len(free))
-    # float64 copies: the kernel overwrites them
-    R, t_HT, t = (np.array(v, dtype=np.float64, order="C") for v in (R, t_HT, t))
-    at = Point(R, t_HT, t, delta)
+    delta = start.delta if isinstance(start, Fit) and len(start.delta) == len(free) else np.zeros(len(free))
+    at = point_of(R, t_HT, t, delta)
     chi2, code, at, N = levenberg_marquardt(rows_of(problem, weight), freed_of(problem, free), at, iterations)
-    # the rounding of many steps, taken off R: the nearest rotation, to second order in its distance
+    R, free_from = at[:9].reshape(3, 3), len(at) - len(delta)
     return Fit(
-        R_HT=at.R_HT @ (_THREE_HALVES - 0.5 * (at.R_HT.T @ at.R_HT)),
-        t_HT=at.t_HT,
-        t=at.t,
-        delta=at.delta,
+        # the rounding of many steps, taken off R: the nearest rotation, to second order in its distance
+        R_HT=R @ (_THREE_HALVES - 0.5 * (R.T @ R)),
+        t_HT=at[9:BALLS],
+        t=at[BALLS:free_from].reshape(t.shape),
+        delta=at[free_from:],
         chi2=float(chi2),
         status=CODES[code],
         N=N,
@@ -94,10 +97,7 @@ def residuals(problem: Problem, free: FreeParameters, fit: Fit) -> Array:
     """(n, 2) px: observed minus calculated centres; NaN where a ball would be behind the source."""
     s = problem.s_0.copy()
     scanner_vectors(freed_of(problem, free), fit.delta, s)
-    x = projected_centres(
-        s, problem.run, fit.R_HT, fit.t_HT, problem.R_MH, problem.t_MH,
-        fit.t[problem.ball], problem.alpha,
-    )  # fmt: skip
+    x = projected_centres(s, problem.run, fit.R_HT, fit.t_HT, problem.poses, fit.t[problem.ball])
     return np.asarray(problem.x_D - x)
 
 

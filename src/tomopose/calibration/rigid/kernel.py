@@ -14,7 +14,20 @@ import numpy as np
 from numba import njit, prange
 from numba.extending import register_jitable
 
-from tomopose.calibration.model.ball_projection import YES, Projected, project_pose
+from tomopose.calibration.model.ball_projection import (
+    EVERYTHING,
+    G_H,
+    G_T,
+    INNER,
+    J_S,
+    MOVES,
+    PROJECTED,
+    VIEW,
+    Y_T,
+    X,
+    project_pose,
+    view_of,
+)
 from tomopose.least_squares import CODES
 from tomopose.units import Array
 
@@ -25,15 +38,13 @@ STEP_TOLERANCE = 1e-10
 
 
 class Rows(NamedTuple):
-    """n observed centres x (n, 2) px with whiteners W (n, 2, 2) and weights (n,) on their squares, the poses R
-    (n, 3, 3), t (n, 3), alpha (n,) of the rows, and the index of each row's run and ball, (n,)."""
+    """n observed centres x (n, 2) px with whiteners W (n, 2, 2) and weights (n,) on their squares, the poses (n, 14) of
+    the rows as of `poses_of`, and the index of each row's run and ball, (n,)."""
 
     x: Array
     W: Array
     weight: Array
-    R: Array
-    t: Array
-    alpha: Array
+    poses: Array
     run: Any
     ball: Any
 
@@ -49,18 +60,9 @@ class Freed(NamedTuple):
     information: Array
 
 
-class Point(NamedTuple):
-    """The unknowns: R_HT (3, 3), t_HT (3,), balls t (balls, 3), deviations delta (f,) of the freed parameters."""
-
-    R_HT: Array
-    t_HT: Array
-    t: Array
-    delta: Array
-
-
-@njit(cache=True, inline="always")
-def _exp_times(w: Array, R: Array, out: Array) -> None:
-    """out = exp([w]_x) R by Rodrigues' formula."""
+@njit(cache=True, **INNER)
+def _turned(w: Array, R: Array, out: Array) -> None:
+    """The first nine numbers of `out`: exp([w]_x) R by Rodrigues' formula, w and R being the first of theirs."""
     a2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     if a2 < 1e-12:
         s, c = 1.0 - a2 / 6.0, 0.5 - a2 / 24.0
@@ -68,14 +70,14 @@ def _exp_times(w: Array, R: Array, out: Array) -> None:
         a = math.sqrt(a2)
         s, c = math.sin(a) / a, (1.0 - math.cos(a)) / a2
     for j in range(3):
-        r0, r1, r2 = R[0, j], R[1, j], R[2, j]
+        r0, r1, r2 = R[j], R[3 + j], R[6 + j]
         c0, c1, c2 = w[1] * r2 - w[2] * r1, w[2] * r0 - w[0] * r2, w[0] * r1 - w[1] * r0
-        out[0, j] = r0 + s * c0 + c * (w[1] * c2 - w[2] * c1)
-        out[1, j] = r1 + s * c1 + c * (w[2] * c0 - w[0] * c2)
-        out[2, j] = r2 + s * c2 + c * (w[0] * c1 - w[1] * c0)
+        out[j] = r0 + s * c0 + c * (w[1] * c2 - w[2] * c1)
+        out[3 + j] = r1 + s * c1 + c * (w[2] * c0 - w[0] * c2)
+        out[6 + j] = r2 + s * c2 + c * (w[0] * c1 - w[1] * c0)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", **INNER)
 def _step(N: Array, lam: float, g: Array, L: Array, step: Array) -> tuple[float, float]:
     """step = (N + lam diag N)^-1 g by Cholesky.
 
@@ -114,64 +116,63 @@ def _step(N: Array, lam: float, g: Array, L: Array, step: Array) -> tuple[float,
 
 @register_jitable
 def scanner_vectors(freed: Freed, delta: Array, s: Array) -> None:
-    """s (runs, 13): the scanner vectors with the freed parameters off their nominal values by delta (f,)."""
+    """The first 13 columns of s (runs, 13 or more): scanner vectors, the freed parameters off their nominal values by
+    the last f numbers of `delta`."""
+    f = freed.cols.shape[0]
     for r in range(s.shape[0]):
-        for i in range(s.shape[1]):
+        for i in range(freed.s_0.shape[1]):
             s[r, i] = freed.s_0[r, i]
-        for j in range(freed.cols.shape[0]):
+        for j in range(f):
             if freed.col_run[j] < 0 or freed.col_run[j] == r:
-                s[r, freed.cols[j]] += freed.factor[j] * delta[j]
-
-
-@njit(cache=True, inline="always")
-def _work_space() -> Projected:
-    return Projected(
-        np.empty(2), np.empty(3), np.empty(3), np.empty((2, 3)), np.empty((2, 3)), np.zeros((2, 13)),
-        np.empty((3, 3)), np.empty((3, 3)),
-    )  # fmt: skip
+                s[r, freed.cols[j]] += freed.factor[j] * delta[delta.shape[0] - f + j]
 
 
 @njit(cache=True, error_model="numpy")
-def normal_equations(rows: Rows, s: Array, freed: Freed, at: Point, N: Array, g: Array) -> float:
+def normal_equations(rows: Rows, freed: Freed, at: Array, N: Array, g: Array) -> float:
     """chi2 at a point, and N = J^T J and g = J^T r there (r = observed - calculated, whitened).
 
-    s (runs, 13): scanner vectors at the point.  Infinite where a ball is behind the source.
+    Infinite where a ball is behind the source.
     """
     # a tuple's array that is read in the loop costs two counts of references each time: name them before
-    x_meas, W, weight, R_k, t_k, alpha, run, ball = rows
-    _, cols, col_run, factor, information = freed
-    R_HT, t_HT, t, delta = at
-    work = _work_space()
-    x, _, y_T, G_H, G_T, J_s, _, _ = work
-    n, n_b, n_f = x_meas.shape[0], t.shape[0], cols.shape[0]
+    x_meas, W, weight, poses, run, ball = rows
+    s_0, cols, col_run, factor, information = freed
+    n, m, n_f = x_meas.shape[0], g.shape[0], cols.shape[0]
+    free_from = m - n_f
     w = 9 + n_f
     a, b, where = np.empty(w), np.empty(w), np.empty(w, dtype=np.int64)
+    out = np.zeros(PROJECTED)
+    wanted = EVERYTHING if n_f > 0 else MOVES
+    views = np.empty((s_0.shape[0], VIEW))
+    scanner_vectors(freed, at, views)
+    for r in range(views.shape[0]):
+        view_of(views, r)
     chi2 = 0.0
     N[:] = 0.0
     g[:] = 0.0
     for i in range(6):
         where[i] = i
     for j in range(n_f):
-        where[9 + j] = 6 + 3 * n_b + j
+        where[9 + j] = free_from + j
     for k in range(n):
         if weight[k] == 0.0:
             continue
-        if not project_pose(s[run[k]], R_HT, t_HT, R_k[k], t_k[k], t[ball[k]], alpha[k], YES, work):
+        if not project_pose(views, at, poses, (run[k], k, ball[k]), wanted, out):
             return np.inf
-        du, dv = x_meas[k, 0] - x[0], x_meas[k, 1] - x[1]
+        du, dv = x_meas[k, 0] - out[X], x_meas[k, 1] - out[X + 1]
         r0 = W[k, 0, 0] * du + W[k, 0, 1] * dv
         r1 = W[k, 1, 0] * du + W[k, 1, 1] * dv
         chi2 += weight[k] * (r0 * r0 + r1 * r1)
         for e in range(2):
             c = a if e == 0 else b
-            c[0] = y_T[1] * G_T[e, 2] - y_T[2] * G_T[e, 1]
-            c[1] = y_T[2] * G_T[e, 0] - y_T[0] * G_T[e, 2]
-            c[2] = y_T[0] * G_T[e, 1] - y_T[1] * G_T[e, 0]
+            G, H, J = G_T + 3 * e, G_H + 3 * e, J_S + 13 * e
+            c[0] = out[Y_T + 1] * out[G + 2] - out[Y_T + 2] * out[G + 1]
+            c[1] = out[Y_T + 2] * out[G] - out[Y_T] * out[G + 2]
+            c[2] = out[Y_T] * out[G + 1] - out[Y_T + 1] * out[G]
             for i in range(3):
-                c[3 + i] = G_T[e, i]
-                c[6 + i] = G_H[e, 0] * R_k[k, 0, i] + G_H[e, 1] * R_k[k, 1, i] + G_H[e, 2] * R_k[k, 2, i]
+                c[3 + i] = out[G + i]
+                c[6 + i] = out[H] * poses[k, i] + out[H + 1] * poses[k, 3 + i] + out[H + 2] * poses[k, 6 + i]
             for j in range(n_f):
-                c[9 + j] = J_s[e, cols[j]] * factor[j] if col_run[j] < 0 or col_run[j] == run[k] else 0.0
+                c[9 + j] = out[J + cols[j]] * factor[j] if col_run[j] < 0 or col_run[j] == run[k] else 0.0
         for i in range(3):
             where[6 + i] = 6 + 3 * ball[k] + i
         for i in range(w):
@@ -181,62 +182,63 @@ def normal_equations(rows: Rows, s: Array, freed: Freed, at: Point, N: Array, g:
         for i in range(w):
             p, q, wi = weight[k] * a[i], weight[k] * b[i], where[i]
             g[wi] += p * r0 + q * r1
-            if n_b == 1:  # every unknown is at its own place: the same sums, written without a detour
+            if m == w:  # every unknown is at its own place: the same sums, written without a detour
                 for j in range(i + 1):
                     N[i, j] += p * a[j] + q * b[j]
             else:
                 for j in range(i + 1):
                     N[wi, where[j]] += p * a[j] + q * b[j]
     for j in range(n_f):
-        chi2 += information[j] * delta[j] * delta[j]
-        g[6 + 3 * n_b + j] -= information[j] * delta[j]
-        N[6 + 3 * n_b + j, 6 + 3 * n_b + j] += information[j]
-    for i in range(g.shape[0]):
+        delta, i = at[at.shape[0] - n_f + j], free_from + j
+        chi2 += information[j] * delta * delta
+        g[i] -= information[j] * delta
+        N[i, i] += information[j]
+    for i in range(m):
         for j in range(i):
             N[j, i] = N[i, j]
     return chi2
 
 
 @njit(cache=True, error_model="numpy")
-def _moved(freed: Freed, at: Point, step: Array, to: Point, s: Array) -> None:
-    """The point after a step, written into `to`, and its scanner vectors s."""
-    n_b = at.t.shape[0]
-    _exp_times(step, at.R_HT, to.R_HT)
-    for i in range(3):
-        to.t_HT[i] = at.t_HT[i] + step[3 + i]
-        for j in range(n_b):
-            to.t[j, i] = at.t[j, i] + step[6 + 3 * j + i]
-    for j in range(at.delta.shape[0]):
-        to.delta[j] = at.delta[j] + step[6 + 3 * n_b + j]
-    scanner_vectors(freed, to.delta, s)
+def _attempt(
+    rows: Rows, freed: Freed, at: Array, N: Array, g: Array, lam: float, to: Array, N_to: Array, g_to: Array
+) -> tuple[float, float, float]:
+    """One step from a point `at` with N and g there, written into `to`, with N_to and g_to there.
+
+    Returns what `_step` does, and chi2 after the step.
+    """
+    m = g.shape[0]
+    step = np.empty(m)
+    gain, length = _step(N, lam, g, np.empty((m, m)), step)
+    if not gain > -np.inf:
+        return gain, length, np.inf
+    _turned(step, at, to)
+    for i in range(3, m):  # w_HT (3) moves R_HT (9)
+        to[6 + i] = at[6 + i] + step[i]
+    return gain, length, normal_equations(rows, freed, to, N_to, g_to)
 
 
 @register_jitable
-def levenberg_marquardt(rows: Rows, freed: Freed, at: Point, iterations: int) -> tuple[float, int, Point, Array]:
-    """Minimise chi2 from the point `at`, which is overwritten.
+def levenberg_marquardt(rows: Rows, freed: Freed, at: Array, iterations: int) -> tuple[float, int, Array, Array]:
+    """Minimise chi2 from the point `at` (R_HT by rows, t_HT, balls, delta), which is overwritten.
 
     One solve runs it in Python, where only what loops over rows or unknowns is compiled; `solve_batch` compiles it.
     Returns (chi2, status, the optimum, N = J^T J there).
     """
-    m = 6 + 3 * at.t.shape[0] + at.delta.shape[0]
-    g, step, L = np.zeros(m), np.zeros(m), np.zeros((m, m))
-    N, g_new, N_new = np.zeros((m, m)), np.zeros(m), np.zeros((m, m))
-    trial = Point(at.R_HT.copy(), at.t_HT.copy(), at.t.copy(), at.delta.copy())
-    s = freed.s_0.copy()
-    scanner_vectors(freed, at.delta, s)
-    chi2 = normal_equations(rows, s, freed, at, N, g)
+    m = at.shape[0] - 6
+    N, g, N_new, g_new = np.empty((m, m)), np.empty(m), np.empty((m, m)), np.empty(m)
+    trial = at.copy()
+    chi2 = normal_equations(rows, freed, at, N, g)
     if not chi2 < np.inf:
         return np.inf, NO_START, at, N
     lam, grow = 1e-4, 2.0
     for _ in range(iterations):
-        gain, length = _step(N, lam, g, L, step)
+        gain, length, chi2_new = _attempt(rows, freed, at, N, g, lam, trial, N_new, g_new)
         if not gain > -np.inf:
             lam = max(lam, 1e-8) * 10.0
             if lam > 1e8:
                 return chi2, SINGULAR, at, N
             continue
-        _moved(freed, at, step, trial, s)
-        chi2_new = normal_equations(rows, s, freed, trial, N_new, g_new)
         small = length < STEP_TOLERANCE * STEP_TOLERANCE
         if chi2_new < chi2 or (small and chi2_new < np.inf) or chi2_new == chi2:
             ratio = (chi2 - chi2_new) / gain if gain > 0 else 1.0
@@ -258,7 +260,7 @@ def levenberg_marquardt(rows: Rows, freed: Freed, at: Point, iterations: int) ->
     return chi2, OUT_OF_STEPS, at, N
 
 
-@njit(cache=True)
+@njit(cache=True, **INNER)
 def _log_rotation(D: Array, out: Array) -> None:
     """Rotation vector of D, angles below pi."""
     c = min(max((D[0, 0] + D[1, 1] + D[2, 2] - 1.0) / 2.0, -1.0), 1.0)
@@ -268,42 +270,40 @@ def _log_rotation(D: Array, out: Array) -> None:
     out[0], out[1], out[2] = f * v0, f * v1, f * v2
 
 
-@njit(cache=True)
+@njit(cache=True, **INNER)
 def _solve_one(
-    rows: Rows, freed: Freed, centre: Array, start: Point, iterations: int, theta: Array
+    rows: Rows, freed: Freed, centre: Array, start: Array, iterations: int, theta: Array
 ) -> tuple[float, int]:
     """One solve from a start with the priors centred at `centre` (f,), its result written into theta (m,)."""
-    n_b, n_f = start.t.shape[0], centre.shape[0]
-    at = Point(start.R_HT.copy(), start.t_HT.copy(), start.t.copy(), start.delta - centre)
+    n_f, at = centre.shape[0], start.copy()
+    held = theta.shape[0] - n_f
     s = freed.s_0.copy()
     scanner_vectors(freed, centre, s)
     shifted = Freed(s, freed.cols, freed.col_run, freed.factor, freed.information)
-    chi2, status, at, _ = levenberg_marquardt(rows, shifted, at, iterations)
-    _log_rotation(at.R_HT @ start.R_HT.T, theta)
-    for i in range(3):
-        theta[3 + i] = at.t_HT[i]
-        for j in range(n_b):
-            theta[6 + 3 * j + i] = at.t[j, i]
     for j in range(n_f):
-        theta[6 + 3 * n_b + j] = centre[j] + at.delta[j]
+        at[6 + held + j] -= centre[j]
+    chi2, status, at, _ = levenberg_marquardt(rows, shifted, at, iterations)
+    _log_rotation(at[:9].reshape(3, 3) @ start[:9].reshape(3, 3).T, theta)
+    for i in range(3, held):
+        theta[i] = at[6 + i]
+    for j in range(n_f):
+        theta[held + j] = centre[j] + at[6 + held + j]
     return chi2, status
 
 
 @njit(cache=True, parallel=True)
 def solve_batch(
-    x_all: Array, R_all: Array, t_all: Array, rows: Rows, freed: Freed, prior: Array, start: Point, iterations: int
+    x_all: Array, poses: Array, rows: Rows, freed: Freed, prior: Array, start: Array, iterations: int
 ) -> Any:
-    """Many solves of one plan, from one start: x_all (b, n, 2); R_all (b or 1, n, 3, 3), t_all (b or 1, n, 3) replace
-    those of `rows`.
+    """Many solves of one plan, from one start: x_all (b, n, 2) and poses (b or 1, n, 14) replace those of `rows`.
 
     prior (b or 1, f): centre of the prior of delta in each solve (a Monte Carlo draws it too).
     Returns theta (b, m): w (by which R = exp(w) R_HT of the start), t_HT, t ..., delta; chi2 (b,); status (b,).
     """
     n_s = x_all.shape[0]
-    m = 6 + 3 * start.t.shape[0] + freed.cols.shape[0]
-    theta, chi2, status = np.empty((n_s, m)), np.empty(n_s), np.empty(n_s, dtype=np.int64)
+    theta, chi2, status = np.empty((n_s, start.shape[0] - 6)), np.empty(n_s), np.empty(n_s, dtype=np.int64)
     for b in prange(n_s):
-        i, j = b % prior.shape[0], b % R_all.shape[0]
-        own = Rows(x_all[b], rows.W, rows.weight, R_all[j], t_all[j], rows.alpha, rows.run, rows.ball)
+        i, j = b % prior.shape[0], b % poses.shape[0]
+        own = Rows(x_all[b], rows.W, rows.weight, poses[j], rows.run, rows.ball)
         chi2[b], status[b] = _solve_one(own, freed, prior[i], start, iterations, theta[b])
     return theta, chi2, status

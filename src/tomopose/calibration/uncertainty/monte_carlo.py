@@ -10,11 +10,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tomopose.calibration.model.ball_projection import point_of, poses_of
 from tomopose.calibration.model.parameters import FreeParameters, base_name, free_parameters
 from tomopose.calibration.model.problem import Problem, pair
 from tomopose.calibration.result import Calibration
 from tomopose.calibration.rigid.fit import Fit, blocks, freed_of, rows_of, tangent_names
-from tomopose.calibration.rigid.kernel import CONVERGED, Point, solve_batch
+from tomopose.calibration.rigid.kernel import CONVERGED, solve_batch
 from tomopose.calibration.rigid.pose_noise import PoseNoise, total_covariance
 from tomopose.errors import InputError
 from tomopose.geometry.rotations import exp_rotation
@@ -76,7 +77,7 @@ def draw(
     sigma = np.where(np.isfinite(free.sigma), free.sigma, 0.0)
     n, f = len(problem), len(free)
     rng = np.random.default_rng(np.random.SeedSequence(seed))
-    start = Point(np.ascontiguousarray(truth.R_HT), truth.t_HT.copy(), truth.t.copy(), truth.delta.copy())
+    start = point_of(truth.R_HT, truth.t_HT, truth.t, truth.delta)
     parts = []
     for first in range(0, draws, BATCH):
         b = min(BATCH, draws - first)
@@ -86,12 +87,12 @@ def draw(
             # the log holds the pose before its scatter: the plate was elsewhere than it says
             R = problem.R_MH @ exp_rotation(noise.rotation * rng.standard_normal((b, n, 3)))
             t = problem.t_MH + noise.translation * rng.standard_normal((b, n, 3))
+        poses = np.array([poses_of(R_b, t_b, problem.alpha) for R_b, t_b in zip(R, t, strict=True)])
         prior = sigma * rng.standard_normal((b, f)) + truth.delta if f else np.zeros((1, 0))
         parts.append(
             solve_batch(
                 np.ascontiguousarray(x),
-                np.ascontiguousarray(R),
-                np.ascontiguousarray(t),
+                poses,
                 rows_of(weighted),
                 freed_of(problem, free),
                 np.ascontiguousarray(prior),
