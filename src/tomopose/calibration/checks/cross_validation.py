@@ -13,7 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tomopose.calibration.checks.score_tests.score import in_pixels
 from tomopose.calibration.model.linear_fit import LinearFit
+from tomopose.units import Array
 
 BLOCKS = 7
 """A seventh of a run is long beside what two neighbours share, and leaves six sevenths to predict from."""
@@ -37,6 +39,11 @@ def blocks_of(n: int, ball: NDArray[np.int64], blocks: int = BLOCKS) -> list[NDA
     return [part for part in parts if len(np.unique(np.delete(ball, part))) == whole]
 
 
+def _flat(A: Array) -> Array:
+    """(2 k, m): rows (k, 2, m), one after the other."""
+    return A.reshape(-1, A.shape[2])
+
+
 def held_out(fit: LinearFit) -> HeldOut:
     """Cross-validate a fit on the rows that it used."""
     n, m = len(fit.problem), fit.J.shape[2]
@@ -45,22 +52,23 @@ def held_out(fit: LinearFit) -> HeldOut:
     if fewest <= m:
         return HeldOut(rms=float("nan"), chi2=float("nan"), log_predictive=float("nan"))
     A, r, W = fit.J_white, fit.r_white, fit.W
-    log_predictive, squares, chi2, count = float(np.sum(np.log(np.einsum("nii->ni", W)))), 0.0, 0.0, 0
+    log_predictive, chi2 = float(np.sum(np.log(np.einsum("nii->ni", W)))), 0.0
     scale = 1.0 / np.sqrt(np.maximum(np.diag(fit.information), 1e-300))
     information = fit.information * scale[:, None] * scale
-    for part in parts:
-        A_b, r_b = A[part].reshape(2 * len(part), -1) * scale, r[part].ravel()
-        # V = I + A_b S_b A_b' has as many rows as the block; what is needed of it has as many as there are parameters.
-        value, axes = np.linalg.eigh(information - A_b.T @ A_b)
-        seen = value > 1e-14 * np.abs(value).max()
-        root = A_b @ (axes[:, seen] / np.sqrt(value[seen]))
-        missed = r_b + root @ (root.T @ r_b)
-        log_det = np.linalg.slogdet(np.eye(root.shape[1]) + root.T @ root)[1]
-        log_predictive -= 0.5 * float(r_b @ missed + log_det)
-        chi2 += float(r_b @ missed)
-        d = np.linalg.solve(W[part], missed.reshape(-1, 2, 1))
-        squares += float(np.sum(d**2))
-        count += len(part)
+    gram = np.array([_flat(A[part]).T @ _flat(A[part]) for part in parts]) * scale[:, None] * scale
+    # V = I + A_b S_b A_b' has as many rows as the block; what is needed of it has as many as there are parameters.
+    value, axes = np.linalg.eigh(information - gram)
+    seen = value > 1e-14 * np.abs(value).max(axis=1, keepdims=True)
+    root = axes * np.where(seen, 1.0 / np.sqrt(np.where(seen, value, 1.0)), 0.0)[:, None, :]
+    log_det = np.linalg.slogdet(np.eye(m) + np.swapaxes(root, 1, 2) @ gram @ root)[1]
+    missed = []
+    for part, S in zip(parts, scale[:, None] * root, strict=True):
+        A_b, r_b = _flat(A[part]), r[part].ravel()
+        missed.append(r_b + A_b @ (S @ (S.T @ (A_b.T @ r_b))))
+        chi2 += float(r_b @ missed[-1])
+    log_predictive -= 0.5 * (chi2 + float(log_det.sum()))
+    rows = np.concatenate(parts)
+    squares, count = float((in_pixels(W[rows], np.concatenate(missed).reshape(-1, 2)) ** 2).sum()), len(rows)
     return HeldOut(
         rms=float(np.sqrt(squares / max(count, 1))), chi2=chi2 / max(2 * count, 1), log_predictive=log_predictive
     )

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -51,9 +52,12 @@ INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 """Of a function that only compiled code calls: a fifth of the time to compile it goes into being called by Python."""
 
 
+_NUMBERS = attrgetter(*SCANNER_COLUMNS[:-1])
+
+
 def scanner_vector(scanner: Scanner, translation_scale: float = 1.0) -> Array:
     """The numbers of SCANNER_COLUMNS, shape (13,)."""
-    return np.array([*(getattr(scanner, name) for name in SCANNER_COLUMNS[:-1]), translation_scale])
+    return np.array([*_NUMBERS(scanner), translation_scale])
 
 
 @njit(cache=True, **INNER)

@@ -92,14 +92,17 @@ def silhouette_outlines(P: Array, centres: Array, diameter: float, which: npt.ND
     C_33 = 1, S = m m^T - C_12, where m is the upper part of its last column.
     """
     M = P[:, :, :3]
-    B = (diameter / 2.0) ** 2 * (M @ np.swapaxes(M, 1, 2))
+    quadric = (diameter / 2.0) ** 2 * (M @ np.swapaxes(M, 1, 2))
+    B = [quadric[:, i, j] for i, j in _UPPER]
     if which is None:
         y = (M @ centres[:, :, None])[..., 0] + P[:, :, 3]
+    elif len(P) == 1:  # one camera sees all
+        y = centres @ M[0].T + P[0, :, 3]
     else:
-        B = B[which]
+        B = [b[which] for b in B]
         y = (centres @ np.swapaxes(M, 1, 2) + P[:, None, :, 3])[which, np.arange(len(which))]
     a, b, c = y.T
-    B_aa, B_ab, B_ac, B_bb, B_bc, B_cc = (B[:, i, j] for i, j in _UPPER)
+    B_aa, B_ab, B_ac, B_bb, B_bc, B_cc = B
     scale = 1.0 / (c * c - B_cc)
     m_a, m_b = (a * c - B_ac) * scale, (b * c - B_bc) * scale
     S_aa, S_bb = m_a * m_a - (a * a - B_aa) * scale, m_b * m_b - (b * b - B_bb) * scale

@@ -16,7 +16,15 @@ from tomopose.calibration.model.ball_projection import (
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, translation_scale
 from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.rigid.kernel import Freed, Rows, levenberg_marquardt, scanner_vectors
+from tomopose.calibration.rigid.kernel import (
+    DAMPING,
+    NEAR_DAMPING,
+    STEP_TOLERANCE,
+    Freed,
+    Rows,
+    levenberg_marquardt,
+    scanner_vectors,
+)
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.least_squares import CODES, Status
@@ -74,12 +82,19 @@ def minimise(
     *,
     weight: Array | None = None,
     iterations: int = ITERATIONS,
+    tolerance: float = STEP_TOLERANCE,
 ) -> Fit:
-    """The optimum reached from a start (a fit, or R_HT, t_HT, t), with weights (n,) on the squared residuals."""
+    """The optimum reached from a start (a fit, or R_HT, t_HT, t), with weights (n,) on the squared residuals.
+
+    tolerance: in standard deviations, of the last step.
+    """
     R, t_HT, t = (start.R_HT, start.t_HT, start.t) if isinstance(start, Fit) else start
     delta = start.delta if isinstance(start, Fit) and len(start.delta) == len(free) else np.zeros(len(free))
+    damping = NEAR_DAMPING if isinstance(start, Fit) and start.converged else DAMPING
     at = point_of(R, t_HT, t, delta)
-    chi2, code, at, N = levenberg_marquardt(rows_of(problem, weight), freed_of(problem, free), at, iterations)
+    chi2, code, at, N = levenberg_marquardt(
+        rows_of(problem, weight), freed_of(problem, free), at, iterations, damping, tolerance
+    )
     R, free_from = at[:9].reshape(3, 3), len(at) - len(delta)
     return Fit(
         # the rounding of many steps, taken off R: the nearest rotation, to second order in its distance

@@ -37,6 +37,11 @@ STEP_TOLERANCE = 1e-10
 """The iteration ends when a step is shorter than this, measured in standard deviations of the estimate."""
 
 
+DAMPING, NEAR_DAMPING = 1e-4, 1e-9
+"""Of the first step from anywhere, and from the optimum of a problem that is nearly the same: directions that the data
+hardly show are followed from the second step on, not from the sixth."""
+
+
 class Rows(NamedTuple):
     """n observed centres x (n, 2) px with whiteners W (n, 2, 2) and weights (n,) on their squares, the poses (n, 14) of
     the rows as of `poses_of`, and the index of each row's run and ball, (n,)."""
@@ -219,8 +224,12 @@ def _attempt(
 
 
 @register_jitable
-def levenberg_marquardt(rows: Rows, freed: Freed, at: Array, iterations: int) -> tuple[float, int, Array, Array]:
+def levenberg_marquardt(
+    rows: Rows, freed: Freed, at: Array, iterations: int, damping: float, tolerance: float
+) -> tuple[float, int, Array, Array]:
     """Minimise chi2 from the point `at` (R_HT by rows, t_HT, balls, delta), which is overwritten.
+
+    damping: of the first step;  tolerance: the iteration ends with a step that is shorter, in standard deviations.
 
     One solve runs it in Python, where only what loops over rows or unknowns is compiled; `solve_batch` compiles it.
     Returns (chi2, status, the optimum, N = J^T J there).
@@ -231,7 +240,7 @@ def levenberg_marquardt(rows: Rows, freed: Freed, at: Array, iterations: int) ->
     chi2 = normal_equations(rows, freed, at, N, g)
     if not chi2 < np.inf:
         return np.inf, NO_START, at, N
-    lam, grow = 1e-4, 2.0
+    lam, grow = damping, 2.0
     for _ in range(iterations):
         gain, length, chi2_new = _attempt(rows, freed, at, N, g, lam, trial, N_new, g_new)
         if not gain > -np.inf:
@@ -239,7 +248,7 @@ def levenberg_marquardt(rows: Rows, freed: Freed, at: Array, iterations: int) ->
             if lam > 1e8:
                 return chi2, SINGULAR, at, N
             continue
-        small = length < STEP_TOLERANCE * STEP_TOLERANCE
+        small = length < tolerance * tolerance
         if chi2_new < chi2 or (small and chi2_new < np.inf) or chi2_new == chi2:
             ratio = (chi2 - chi2_new) / gain if gain > 0 else 1.0
             at, trial, N, N_new, g, g_new = trial, at, N_new, N, g_new, g
@@ -250,9 +259,9 @@ def levenberg_marquardt(rows: Rows, freed: Freed, at: Array, iterations: int) ->
             lam = max(lam * min(max(cut, 0.02), 1.0), 1e-15)
             grow = 2.0
         else:
-            # at the floor of rounding a step no longer lowers chi2: that is the optimum too
+            # at the floor of rounding a step no longer lowers chi2: the gradient, which is more exact, is followed
             if length < 1e-12 * max(chi2, 1e-6) or length < 1e-14:
-                return chi2, CONVERGED, at, N
+                return (chi2, CONVERGED, trial, N_new) if chi2_new < np.inf else (chi2, CONVERGED, at, N)
             lam *= grow
             grow *= 2.0
             if lam > 1e12:
@@ -282,7 +291,7 @@ def _solve_one(
     shifted = Freed(s, freed.cols, freed.col_run, freed.factor, freed.information)
     for j in range(n_f):
         at[6 + held + j] -= centre[j]
-    chi2, status, at, _ = levenberg_marquardt(rows, shifted, at, iterations)
+    chi2, status, at, _ = levenberg_marquardt(rows, shifted, at, iterations, DAMPING, STEP_TOLERANCE)
     _log_rotation(at[:9].reshape(3, 3) @ start[:9].reshape(3, 3).T, theta)
     for i in range(3, held):
         theta[i] = at[6 + i]

@@ -49,27 +49,22 @@ def shares_of(
 ) -> tuple[float, float, list[tuple[str, float]]]:
     """(total, measured, shares): J (k, c) px of the scan, covariance (c, c), columns of what was assumed, by name."""
     M = J.T @ J / max(len(J), 1)
+    MC = M @ covariance
+    total2 = max(float(np.trace(MC)), 0.0)
 
-    def rms(C: Array) -> float:
-        return float(np.sqrt(max((M * C).sum(), 0.0)))
-
-    def known(C: Array, which: list[int]) -> Array:
-        """The covariance if those coordinates were exact."""
-        S = C[np.ix_(which, which)]
+    def due_to(which: list[int]) -> float:
+        """By how much the mean square would fall if those coordinates were exact: C falls by G S^+ G^T."""
+        S = covariance[np.ix_(which, which)]
         scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
-        G = C[:, which] * scale
+        H = (covariance[which] @ MC[:, which]) * scale[:, None] * scale
         if len(which) == 1:  # scaled to 1, or without any variance
-            return np.asarray(C - G @ G.T)
-        return np.asarray(C - G @ np.linalg.pinv(S * scale[:, None] * scale, rcond=1e-12) @ G.T)
+            return float(H[0, 0])
+        return float((np.linalg.pinv(S * scale[:, None] * scale, rcond=1e-12, hermitian=True) * H).sum())
 
-    total = rms(covariance)
     everything = [j for which in columns.values() for j in which]
-    measured = rms(known(covariance, everything)) if everything else total
-    parts = [
-        (name, float(np.sqrt(max(total**2 - rms(known(covariance, which)) ** 2, 0.0))))
-        for name, which in columns.items()
-    ]
-    return total, measured, sorted(parts, key=lambda p: -p[1])
+    measured = float(np.sqrt(max(total2 - due_to(everything), 0.0))) if everything else float(np.sqrt(total2))
+    parts = [(name, float(np.sqrt(min(max(due_to(which), 0.0), total2)))) for name, which in columns.items()]
+    return float(np.sqrt(total2)), measured, sorted(parts, key=lambda p: -p[1])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,6 +22,7 @@ from tomopose.calibration.model.parameters import (
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.model.silhouettes import Cameras, size_ratio_of
 from tomopose.calibration.rigid.fit import Fit, minimise, residuals, whitened2
+from tomopose.calibration.rigid.kernel import STEP_TOLERANCE
 from tomopose.calibration.rigid.start import Rays, closed_forms, other_starts, ray_equations, turned_about_beam
 from tomopose.units import Array
 
@@ -31,6 +32,9 @@ ITERATIONS = 20
 FIRST_ROWS, HOPELESS = 48, 100.0
 """Where there are more than twice as many rows, an alternative is fitted to so many of them first; one that then leaves
 so many times the declared reading's chi2 (or dof) in all rows is wrong, and is not fitted to all of them."""
+
+PASSING = 1e-4
+"""Last step, in standard deviations, of a fit that another one starts from or that is hopeless."""
 
 SCANNER_GAIN = 1e3
 """Values of the scanner that were off by 30 times what is assumed of them would lower chi2 so much."""
@@ -169,11 +173,12 @@ def fitted(
     """
     problem, weight = one.problem, one.weight
     enough = np.inf if one.whole else SCANNER_GAIN * hopeless * len(one.rows) / len(problem)
-    fit = minimise(problem, held, start, weight=weight, iterations=ITERATIONS)
+    last = STEP_TOLERANCE if one.whole else PASSING
+    fit = minimise(problem, held, start, weight=weight, iterations=ITERATIONS, tolerance=PASSING if len(free) else last)
     if not np.isfinite(fit.chi2):
         fit = _from_elsewhere(one, start, held, starts)
     if len(free) and fit.chi2 < enough:
-        fit = minimise(problem, free, fit, weight=weight, iterations=ITERATIONS)
+        fit = minimise(problem, free, fit, weight=weight, iterations=ITERATIONS, tolerance=last)
     if len(fit.delta) != len(free):
         fit = replace(fit, delta=np.zeros(len(free)))
     r = residuals(problem, free, fit)

@@ -132,5 +132,6 @@ def evidence_together(beside: Ranked, declared: Ranked, before: Whitened, C: Arr
     fits = min((declared.chi2 - left) / 2, declared.dof / 2 * float(np.log(max(declared.chi2, 1e-300) / left)))
     # half the log determinant of 1 + prior x information: what the freedom of the assumed values costs
     n = 2 * before.n
-    C = Beside.of(before.A[:n], before.r[:n]).without(C)
+    beside = before.beside if n == len(before.r) else Beside.of(before.A[:n], before.r[:n])
+    C = beside.without(C)
     return fits - 0.5 * float(np.linalg.slogdet(np.eye(C.shape[1]) + C.T @ C)[1])
