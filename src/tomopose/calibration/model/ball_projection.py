@@ -210,11 +210,6 @@ def _project_all(s: Array, run: Any, at: Array, poses: Array, wanted: int, found
             x[k, 0], x[k, 1] = out[X], out[X + 1]
 
 
-def point_of(R_HT: Array, t_HT: Array, *rest: Array) -> Array:
-    """(12 + k,): a mount and k more numbers, as `project_pose` takes them; see BALLS."""
-    return np.concatenate([R_HT.ravel(), t_HT, *(x.ravel() for x in rest)])
-
-
 def poses_of(R_MH: Array, t_MH: Array, alpha: Array) -> Array:
     """(n, 14): R_MH (n, 3, 3), t_MH (n, 3) and table angles alpha (n,), as `project_pose` takes them."""
     poses = np.empty((len(R_MH), POSE))
@@ -231,7 +226,7 @@ def projected_centres(s: Array, run: Any, R_HT: Array, t_HT: Array, poses: Array
     `poses_of`;  t: (n, 3) ball centres in M, mm.
     """
     x = np.full((len(poses), 2), np.nan)
-    _project_all(s, run, point_of(R_HT, t_HT, t), poses, CENTRE, np.empty((1, PROJECTED)), x)
+    _project_all(s, run, np.concatenate([R_HT.ravel(), t_HT, t.ravel()]), poses, CENTRE, np.empty((1, PROJECTED)), x)
     return x
 
 
@@ -299,7 +294,7 @@ def projection_blocks(
     poses = poses_of(R_MH, T_MH.t, np.broadcast_to(np.asarray(alpha, dtype=np.float64), (n,)))
     index = np.zeros(n, dtype=np.int64) if run is None else np.array(run, dtype=np.int64)
     x, b = np.full((n, 2), np.nan), np.zeros((n, PROJECTED))
-    _project_all(s, index, point_of(T_HT.R, T_HT.t, t_k), poses, EVERYTHING, b, x)
+    _project_all(s, index, np.concatenate([T_HT.R.ravel(), T_HT.t, t_k.ravel()]), poses, EVERYTHING, b, x)
     by_T, by_H = (b[:, first : first + 6].reshape(n, 2, 3) for first in (G_T, G_H))
     return ProjectionBlocks(
         x_D=x, J_w_HT=np.cross(b[:, None, Y_T : Y_T + 3], by_T), J_t_HT=by_T, J_t=by_H @ R_MH,

@@ -9,7 +9,6 @@ import numpy as np
 from tomopose.calibration.model.ball_projection import (
     BALLS,
     ProjectionBlocks,
-    point_of,
     projected_centres,
     projection_blocks,
 )
@@ -91,7 +90,7 @@ def minimise(
     R, t_HT, t = (start.R_HT, start.t_HT, start.t) if isinstance(start, Fit) else start
     delta = start.delta if isinstance(start, Fit) and len(start.delta) == len(free) else np.zeros(len(free))
     damping = NEAR_DAMPING if isinstance(start, Fit) and start.converged else DAMPING
-    at = point_of(R, t_HT, t, delta)
+    at = np.concatenate([R.ravel(), t_HT, t.ravel(), delta])
     chi2, code, at, N = levenberg_marquardt(
         rows_of(problem, weight), freed_of(problem, free), at, iterations, damping, tolerance
     )

@@ -72,7 +72,7 @@ def total_covariance(covariance: Array, b: ProjectionBlocks, noise: PoseNoise) -
     return covariance + noise.translation**2 * A + noise.rotation**2 * B
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _minus_2_log_likelihood(
     C: Array, A: Array, B: Array, J: Array, r: Array, information: Array, pull: Array, s_t: float, s_w: float
 ) -> float:
@@ -86,18 +86,19 @@ def _minus_2_log_likelihood(
         v00 = C[k, 0, 0] + a * A[k, 0, 0] + b * B[k, 0, 0]
         v01 = C[k, 0, 1] + a * A[k, 0, 1] + b * B[k, 0, 1]
         v11 = C[k, 1, 1] + a * A[k, 1, 1] + b * B[k, 1, 1]
-        l00 = math.sqrt(v00)
-        l10 = v01 / l00
-        l11 = math.sqrt(v11 - l10 * l10)
-        total += 2.0 * (math.log(l00) + math.log(l11))
-        x = r[k, 0] / l00
-        y = (r[k, 1] - l10 * x) / l11
+        i00 = 1.0 / math.sqrt(v00)
+        l10 = v01 * i00
+        i11 = 1.0 / math.sqrt(v11 - l10 * l10)
+        total -= 2.0 * math.log(i00 * i11)
+        x = r[k, 0] * i00
+        y = (r[k, 1] - l10 * x) * i11
         total += x * x + y * y
         for i in range(m):
-            p_i = J[k, 0, i] / l00
-            q_i = (J[k, 1, i] - l10 * p_i) / l11
-            p[i], q[i] = p_i, q_i
-            g[i] += p_i * x + q_i * y
+            p[i] = J[k, 0, i] * i00
+            q[i] = (J[k, 1, i] - l10 * p[i]) * i11
+            g[i] += p[i] * x + q[i] * y
+        for i in range(m):
+            p_i, q_i = p[i], q[i]
             for j in range(i + 1):
                 N[i, j] += p_i * p[j] + q_i * q[j]
     for i in range(m):

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tomopose.calibration.model.ball_projection import point_of, poses_of
+from tomopose.calibration.model.ball_projection import poses_of
 from tomopose.calibration.model.parameters import FreeParameters, base_name, free_parameters
 from tomopose.calibration.model.problem import Problem, pair
 from tomopose.calibration.result import Calibration
@@ -77,7 +77,7 @@ def draw(
     sigma = np.where(np.isfinite(free.sigma), free.sigma, 0.0)
     n, f = len(problem), len(free)
     rng = np.random.default_rng(np.random.SeedSequence(seed))
-    start = point_of(truth.R_HT, truth.t_HT, truth.t, truth.delta)
+    start = np.concatenate([truth.R_HT.ravel(), truth.t_HT, truth.t.ravel(), truth.delta])
     parts = []
     for first in range(0, draws, BATCH):
         b = min(BATCH, draws - first)

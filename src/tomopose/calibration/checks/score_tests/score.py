@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from tomopose.calibration.model.ball_projection import ProjectionBlocks
+from tomopose.calibration.model.ball_projection import INNER, ProjectionBlocks
 from tomopose.calibration.model.parameters import FreeParameters
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.model.tall import is_tall, parts, triangle
@@ -136,7 +136,7 @@ def in_pixels(W: Array, v: Array) -> Array:
     return np.column_stack([du, (v[:, 1] - W[:, 1, 0] * du) / W[:, 1, 1]])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy", **INNER)
 def _one_place(M: Array, z: Array, S: Array, x: Array) -> float:
     """z^T M^-1 z by Cholesky; NaN where an eigenvalue of M (c, c), its diagonal at most 1, may be as small as SEEN: the
     trace of the inverse bounds it.  S (c, c) and x (c,) are work space."""
@@ -166,7 +166,7 @@ def _one_place(M: Array, z: Array, S: Array, x: Array) -> float:
     return gain if trace < 1.0 / SEEN else np.nan
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _places(C: Array, Q: Array, r: Array, sums: tuple[Array, Array, Array], M: Array, z: Array, gain: Array) -> None:
     """gain (n,) of a step at each of n rows, from the last one back: C (n, 2, c), Q (n, 2, q), r (n, 2).
 
