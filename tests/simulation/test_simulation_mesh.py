@@ -178,6 +178,15 @@ def test_stl_there_and_back(tmp_path):
         read_mesh(tmp_path / "none.stl")
 
 
+def test_a_mesh_file_that_was_written_anew_is_read_anew(tmp_path):
+    pytest.importorskip("trimesh")
+    path = tmp_path / "part.stl"
+    write_stl(path, CUBE)
+    assert read_mesh(path).volume == pytest.approx(8.0)
+    write_stl(path, TriangleMesh(vertices=1.5 * CUBE.vertices, faces=CUBE.faces))
+    assert read_mesh(path).volume == pytest.approx(27.0)
+
+
 def test_the_specimen_is_closed_and_as_long_as_the_paper_s():
     mesh = specimen_mesh(edge=3.0, segments=60).require_closed()
     assert np.ptp(mesh.vertices[:, 2]) == pytest.approx(LENGTH)

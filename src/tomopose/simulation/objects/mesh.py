@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from tomopose.errors import EngineFailedError, EngineMissingError, FileError, InputError, ShapeError
 from tomopose.geometry.frames import Frame
+from tomopose.provenance import sha256
 from tomopose.reading import reader
 from tomopose.units import Array
 
@@ -204,7 +205,8 @@ def mesh_paths(solid: MeshSolid, o: Array, d: Array) -> Array:
 
 
 @functools.lru_cache(maxsize=4)
-def _load(path: str, scale: float) -> TriangleMesh:
+def _load(path: str, scale: float, digest: str) -> TriangleMesh:
+    """The mesh of a file whose content has this digest: a file that is written anew is read anew."""
     try:
         import trimesh
     except ImportError as error:
@@ -219,7 +221,7 @@ def _load(path: str, scale: float) -> TriangleMesh:
 @reader("mesh")
 def read_mesh(path: str | Path, *, scale: float = 1.0) -> TriangleMesh:
     """A closed triangle mesh from an STL, PLY or OBJ file; scale: mm per unit of the file."""
-    return _load(str(path), scale)
+    return _load(str(path), scale, sha256(path))
 
 
 def write_stl(path: str | Path, mesh: TriangleMesh) -> None:
