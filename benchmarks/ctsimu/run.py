@@ -39,7 +39,7 @@ SPOTS = {"spot1": (1, 9.579, 29.852), "spot2": (2, 24.552, 11.770)}
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One line of the table; passed is None where the test cannot be run."""
+    """One line of the table; passed is None where the test cannot be run or its reference is known to be off."""
 
     test: str
     found: str
@@ -256,8 +256,8 @@ def focal_spot(place: Place) -> list[Row]:
 
 def partial_pixels(place: Place) -> list[Row]:
     rows = []
-    # The toolbox's own edge leans by another angle than the 3 degrees of its documentation: it turns a vector's y by
-    # the x that it has already turned.
+    # The toolbox's own edge leans by 3.008 and 2.996 degrees, not by the 3 of its documentation: it turns a vector's y
+    # by the x that it has already turned. The edge of the documentation is imaged beside, without a verdict.
     c, s = math.cos(math.radians(3)), math.sin(math.radians(3))
     edges = (("3 degrees", math.radians(3), None), ("as the toolbox turns", math.atan(s / (c - s * s)), math.atan(s)))
     with analytical_image_once(place.folder, place.threads):
@@ -271,8 +271,8 @@ def partial_pixels(place: Place) -> list[Row]:
                 Row(
                     test=f"2D-WE-2, edge {name}",
                     found=f"{both:.2f} % of the pixels, {ours:.0f} partly covered, RMSD {rmsd:.1f} of 60000",
-                    tolerance="98 %, RMSD 600, 1 % (own)" if top is None else "98 %, RMSD 120, 0.2 % (own)",
-                    passed=both >= 98 and rmsd <= (600 if top is None else 120),
+                    tolerance="the reference is another edge" if top is None else "98 %, RMSD 120, 0.2 % (own)",
+                    passed=None if top is None else both >= 98 and rmsd <= 120,
                 )
             )
     return rows
@@ -402,7 +402,7 @@ def main() -> int:
         for name in options.only.split(","):
             for row in TESTS[name](place):
                 failed += row.passed is False
-                word = {True: "passed", False: "NOT", None: "not run"}[row.passed]
+                word = {True: "passed", False: "NOT", None: "-"}[row.passed]
                 print(f"{row.test:34s} | {row.found:62s} | {word:8s} | {row.tolerance}", flush=True)
     return 1 if failed else 0
 
