@@ -88,6 +88,7 @@ def test_a_history_grows_once_for_each_run_and_answers_first(files, days, capsys
     assert "No alarm" in page.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_a_run_is_added_once_and_a_failing_command_adds_nothing(files, days, capsys):
     history = files.folder / "history.jsonl"
     a, b = days("a", 1), days("b", 2)

@@ -53,6 +53,7 @@ def test_error_is_near_the_bound(small: list[Crop], bound: float, snr: float, ra
     assert np.sqrt((error**2).sum(axis=1).mean()) * snr / bound < ratio
 
 
+@pytest.mark.slow
 def test_sigma_is_honest(small: list[Crop]) -> None:
     """90 crops, 180 normalised errors: their variance is 1 within three times its chance of 10 %."""
     rng = np.random.default_rng(11)

@@ -161,6 +161,7 @@ def test_impossible_values_are_named(file, changes, message):
         read_scanner(file(**changes))
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.sampled_from([*KNOWN[:-1], "voltage"]),

@@ -179,6 +179,7 @@ def test_the_bound_holds_and_the_choice_is_near_the_best_of_all(rng):
         assert bound <= 1.05 * best
 
 
+@pytest.mark.slow
 def test_a_plan_keeps_to_narrow_one_sided_and_empty_intervals(small_scanner):
     low, high = np.array([-3.0, 1.0, 0.0, -0.05, 0.0, 0.0, 0.4]), np.array([2.0, 1.0, 4.0, 0.02, 0.06, 0.0, 2.5])
     limits = ScanLimits(travel=TravelLimits(low=low, high=high))
@@ -265,6 +266,7 @@ def test_what_cannot_be_planned_is_said_in_words(small_scanner):
         plan_part_scan(setting(small_scanner, views=100_000))
 
 
+@pytest.mark.slow
 def test_what_no_view_shows_is_named_with_its_remedy(small_scanner):
     flat = default_travel()
     low, high = flat.low.copy(), flat.high.copy()

@@ -49,6 +49,7 @@ def tilted_turn(setting: Setting) -> np.ndarray:
     return setting.machine.matrices(q)
 
 
+@pytest.mark.slow
 def test_the_noise_of_sums_over_a_volume_is_that_of_sart(rng):
     """White noise of the line integrals through `reconstruct`; sums over a voxel, a face's patch and a column."""
     setting = task()

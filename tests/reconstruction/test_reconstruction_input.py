@@ -106,6 +106,7 @@ def test_counts_transmissions_and_line_integrals_agree():
         assert np.abs(found - expected).max() < 1e-4 * np.ptp(expected)
 
 
+@pytest.mark.slow
 def test_a_sequence_that_knows_what_it_holds_needs_no_word():
     class Known(list):
         images_are = "line-integrals"
