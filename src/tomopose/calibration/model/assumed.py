@@ -50,8 +50,10 @@ DEFAULTS: Mapping[str, Default] = MappingProxyType(
         "axis_tilt_y": Default(sigma=2e-4, source=_AXIS_TILT),
     }
 )
-"""Name -> default of a scanner's value, in the value's own unit.  axis_y is 0.2 mm / 5.3, a voxel of the paper's scanner,
-and tuned on benchmarks/reality: with 0.02 mm a scan of a still table's calibration was 7.7 stated sigmas off."""
+"""Name -> default of a scanner's value, in the value's own unit.
+
+axis_y is 0.2 mm / 5.3, a voxel of the paper's scanner, and tuned on benchmarks/reality: with 0.02 mm a scan was 7.7
+stated sigmas off where the table had stood still in the calibration."""
 
 ROTATION_SCALE, AS_DELIVERED_ROTATION_SCALE = 2e-5, 1.3e-4
 """Scale error of a platform's rotations: that of linear encoders with the geometry of the joints; and of a platform as
