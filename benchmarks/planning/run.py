@@ -3,6 +3,7 @@
     python benchmarks/planning/run.py                   certificates and worth of five parts, time of a large one
     python benchmarks/planning/run.py --images --views 24 --draws 16    virtual scans: lengths and their uncertainty
     python benchmarks/planning/run.py --images --parts plate bracket    of some parts only
+    python benchmarks/planning/run.py --images --views 24 --draws 0 --paths plan circular   the two predictions alone
 
 
 Random paths are N of the candidates: the gain is over the best of ten draws, "over one" over their mean.  Judged on

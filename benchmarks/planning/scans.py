@@ -3,7 +3,8 @@
 Coarse on purpose: a panel read out in blocks (the box's walls need its pixels), voxels of a pixel's size at the part,
 few views.  The projections of a path are simulated once; each draw adds noise of its own, reconstructs, and measures by
 the plan.  Mean and scatter of the draws separate what is systematic (few views, cone beam, hardening, scatter,
-sampling) from what is random, and it is the random part that the prediction states.
+sampling) from what is random, and it is the random part that the prediction states: by filters, and through SART's own
+steps ("exact").  The scatter of few draws is itself uncertain; with --draws 0 only the two predictions are compared.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from parts import Case
+from scipy.stats import chi2
 
 import tomopose as tp
 from tomopose.errors import InputError
@@ -47,17 +49,18 @@ PATHS = ("plan", "half", "circular")
 
 @dataclass(frozen=True, kw_only=True)
 class Lengths:
-    """Of one path: length -> values of the draws minus the nominal one, and the predicted u, mm."""
+    """Of one path: length -> values of the draws minus the nominal one, and u predicted by filters and exactly, mm."""
 
     errors: dict[str, list[float]]
     u: dict[str, float]
+    exact: dict[str, float]
 
     @property
     def rms(self) -> float:
         return math.sqrt(np.mean([np.square(v).mean() for v in self.errors.values()]))
 
     def scatter(self, name: str) -> float:
-        return float(np.std(self.errors[name], ddof=1))
+        return float(np.std(self.errors[name], ddof=1)) if len(self.errors[name]) > HALF_DRAWS else math.nan
 
 
 def nominal(plan: tp.MeasurementPlan) -> dict[str, float]:
@@ -132,49 +135,66 @@ def scanned(case: Case, task: Setting, q: Array, draws: int) -> Lengths:
     mu = apparent_mu(case, P[:: max(len(P) // 8, 1)], signals[:: max(len(P) // 8, 1)])
     shown = replace(task.settings, mu=mu, sweeps=SWEEPS, room=ROOM * spacing(task))
     goal = replace(replace(task, features=case.lengths).goal(judged=True), settings=shown)
-    u = predicted(goal, s, P, table(goal, P), plan=case.lengths)[1]
-    return Lengths(errors=errors, u=u)
+    ways = (goal, replace(goal, settings=replace(shown, exact=True))) if draws != HALF_DRAWS else ()
+    u, exact = ([predicted(w, s, P, table(w, P), plan=case.lengths)[1] for w in ways] + [{}, {}])[:2]
+    return Lengths(errors=errors, u=u, exact=exact)
 
 
-def compare(name: str, case: Case, task: Setting, draws: int, wanted: Sequence[str]) -> list[float]:
-    """Prints errors and scatter of every length along the wanted paths; returns predicted over achieved scatter."""
+def compare(name: str, case: Case, task: Setting, draws: int, wanted: Sequence[str]) -> list[tuple[float, ...]]:
+    """Prints errors and scatter of every length along the wanted paths; returns (scatter, u by filters, exact u)."""
     task = replace(task, scanner=task.scanner.binned(case.binning), features=case.lengths)
     coarse = replace(task.settings, alpha_step=math.radians(6.0), tilt_step=math.radians(5.0))
     task = replace(task, settings=coarse)
-    ratios: list[float] = []
+    rows: list[tuple[float, ...]] = []
     for path in wanted:
         start, N = time.process_time(), task.views // 2 if path == "half" else task.views
         circular = path == "circular"
         q = usual_paths(task.machine, N)[path] if circular else plan_part_scan(replace(task, views=N)).chosen.q
-        count = HALF_DRAWS if path == "half" else draws
         try:
-            found = scanned(case, task, q, count)
+            found = scanned(case, task, q, HALF_DRAWS if path == "half" else draws)
         except InputError as error:
             print(f"{name:<9} {path:<9}{len(q):>3}  not measurable: {error}", flush=True)
             continue
         for length, values in found.errors.items():
-            u, sd = found.u[length], found.scatter(length)
-            text = "" if count == HALF_DRAWS else f"{1000 * sd:8.2f}{1000 * u:8.2f}{u / sd:7.2f}"
-            print(f"{name:<9} {path:<9}{len(q):>3}  {length:<18}{1000 * np.mean(values):9.1f}{text}", flush=True)
-            if count != HALF_DRAWS:
-                ratios.append(u / sd)
+            mean = f"{1000 * np.mean(values):9.1f}" if values else f"{'':9}"
+            row = found.scatter(length), found.u.get(length, math.nan), found.exact.get(length, math.nan)
+            text = "" if path == "half" else "".join(f"{1000 * x:8.2f}" for x in row) + f"{row[1] / row[2]:7.2f}"
+            text += f"{row[1] / row[0]:7.2f}{row[2] / row[0]:7.2f}" if math.isfinite(row[0]) else ""
+            print(f"{name:<9} {path:<9}{len(q):>3}  {length:<18}{mean}{text}", flush=True)
+            rows += [row] if path != "half" else []
+        rms = f"rms error {1000 * found.rms:.0f} um, " if all(found.errors.values()) else ""
+        print(f"{name:<9} {path:<9}{len(q):>3}  {rms}{time.process_time() - start:.0f} s CPU", flush=True)
+    return rows
+
+
+def _held(words: str, ratios: np.ndarray) -> None:
+    ratios = ratios[~np.isnan(ratios)]
+    if len(ratios):
+        held = (ratios >= HOLDS[0]) & (ratios <= HOLDS[1])
+        low, middle, high = np.percentile(ratios, [5, 50, 95])
         print(
-            f"{name:<9} {path:<9}{len(q):>3}  rms error {1000 * found.rms:.0f} um, "
-            f"{time.process_time() - start:.0f} s CPU",
-            flush=True,
+            f"{words}: {held.sum()} of {len(ratios)} within {HOLDS[0]} to {HOLDS[1]}; median {middle:.2f}, 5 and 95 % "
+            f"{low:.2f}, {high:.2f}"
         )
-    return ratios
+
+
+def perfect(draws: int) -> float:
+    """Share of the standard deviations of so many draws that are within HOLDS of the true one."""
+    n = draws - 1
+    return float(chi2.cdf(n / HOLDS[0] ** 2, n) - chi2.cdf(n / HOLDS[1] ** 2, n))
 
 
 def compare_all(cases: dict[str, tuple[Case, Setting]], draws: int, wanted: Sequence[str]) -> None:
-    """All parts: mean error, scatter, predicted scatter in um and their ratio; then how many hold."""
-    print(f"{draws} draws, {SWEEPS} sweeps of SART; mean error; scatter; predicted scatter, um; ratio")
-    ratios = np.array([r for name, (case, task) in cases.items() for r in compare(name, case, task, draws, wanted)])
-    if not len(ratios):
-        return
-    held = (ratios >= HOLDS[0]) & (ratios <= HOLDS[1])
+    """All parts: mean error, scatter, predicted scatter in um by filters and exactly; how many hold."""
     print(
-        f"predicted / achieved: {held.sum()} of {len(ratios)} within {HOLDS[0]} to {HOLDS[1]}; median "
-        f"{np.median(ratios):.2f}, 5 and 95 % {np.percentile(ratios, 5):.2f}, {np.percentile(ratios, 95):.2f}; a "
-        f"standard deviation of {draws} draws is uncertain by {100 / math.sqrt(2 * (draws - 1)):.0f} %"
+        f"{draws} draws, {SWEEPS} sweeps of SART; mean error; scatter of the draws; predicted by filters; exact, um; "
+        "filters / exact; filters / draws; exact / draws"
     )
+    rows = [r for name, (case, task) in cases.items() for r in compare(name, case, task, draws, wanted)]
+    scatter, u, exact = np.array(rows).reshape(-1, 3).T
+    with np.errstate(invalid="ignore"):
+        _held("filters / exact", u / exact)
+        if draws > HALF_DRAWS:
+            _held("filters / draws", u / scatter)
+            _held("exact / draws", exact / scatter)
+            print(f"a perfect prediction would hold in {100 * perfect(draws):.0f} % of the cases with {draws} draws")

@@ -11,17 +11,22 @@ import pytest
 from scipy.sparse import csr_array
 
 import tomopose as tp
+from tomopose.geometry.box import BOX_CORNERS
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.measurement.mesh.mesh import Mesh
 from tomopose.measurement.plan import plan_from
+from tomopose.measurement.surface.splines import spline_coefficients
+from tomopose.planning.part import sart_steps as sart_steps_module
 from tomopose.planning.part.part import Part
 from tomopose.planning.part.predict import _lengths, _slopes, predicted
-from tomopose.planning.part.sart_response import RELAXATION, sart_response
+from tomopose.planning.part.sart_response import RELAXATION, Blocks, blocks, sart_response
+from tomopose.planning.part.sart_steps import sart_steps, weights_on_pixels
 from tomopose.planning.part.settings import PartSettings
 from tomopose.planning.part.targets import probed_targets
 from tomopose.planning.part.worth import table
 from tomopose.planning.part_scan.setting import Setting
 from tomopose.reconstruction.settings import SART
+from tomopose.reconstruction.updates import SHORTEST_RAY
 
 HALF = np.array([9.0, 7.0, 4.0])
 VIEWS, SWEEPS = 15, 2
@@ -89,6 +94,63 @@ def test_the_noise_of_sums_over_a_volume_is_that_of_sart(rng):
     expected = np.sqrt(np.diag(response.covariance(np.concatenate(sums), csr_array(weights))))
     # a standard deviation of 40 draws is uncertain by 11 %; the filters take planes of Fourier space as separate
     np.testing.assert_allclose(expected / achieved, 1.0, atol=0.35)
+
+
+def test_the_steps_of_sart_backwards_are_the_transpose_of_reconstruct(rng):
+    """c . x = g . p for the volume x that `reconstruct` makes of any line integrals p, the box beyond the panel too."""
+    setting = task()
+    P, s = tilted_turn(setting), setting.scanner
+    # 36 x 32 x 20 mm: its corners leave the panel in some views
+    box = tp.VoxelGrid((31, 50, 56), s.p_u * s.d_SR / s.d_SD, np.array([0.3, -0.2, 0.1]))
+    names = tuple(str(j) for j in range(VIEWS))
+    matrices = ProjectionMatrices(P=P, n_u=s.n_u, n_v=s.n_v, p_u=s.p_u, p_v=s.p_v, pose_id=names, scanner=s)
+    p = rng.normal(0, 0.01, (VIEWS, s.n_v, s.n_u)).astype(np.float32)
+    volume = tp.reconstruct(
+        p,
+        matrices,
+        box,
+        images_are="line-integrals",
+        algorithm=SART(iterations=SWEEPS),
+        engine="cpu",
+        consistency="off",
+    )
+    scale = float(np.sqrt(np.mean(volume.values**2)))
+    for c in (rng.normal(size=box.shape), np.eye(1, box.size, box.size // 3).reshape(box.shape)):
+        g = weights_on_pixels(matrices, box, c, SWEEPS)
+        assert np.vdot(g, p) == pytest.approx(np.vdot(c, volume.values), abs=1e-3 * scale * np.linalg.norm(c))
+
+
+def test_sart_step_by_step_is_reconstruct_and_both_leave_out_the_same_rays():
+    setting = task()
+    steps = sart_steps(setting.part, setting.scanner, tilted_turn(setting), setting.settings)
+    L = -np.log(blocks_of(setting).tau)
+    how = {"images_are": "line-integrals", "engine": "cpu", "consistency": "off"}
+    found = tp.reconstruct(L, steps.matrices, steps.box, algorithm=SART(iterations=SWEEPS), **how)
+    np.testing.assert_allclose(steps.coefficients, spline_coefficients(found.values), atol=2e-5)
+    assert sart_steps_module.SHORTEST_RAY == SHORTEST_RAY
+    x = steps.box.points(np.array([[5, 6, 7], [8, 9, 10]]))
+    np.testing.assert_allclose(steps.at(x), [found.values[5, 6, 7], found.values[8, 9, 10]], atol=2e-5)
+
+
+def blocks_of(setting: Setting) -> Blocks:
+    half = np.ptp(setting.part.mesh.points, axis=0) / 2 + setting.settings.room
+    corners = setting.part.centre + half * BOX_CORNERS
+    return blocks(setting.part, setting.scanner, tilted_turn(setting), setting.settings, corners=corners)
+
+
+def test_the_exact_prediction_is_near_that_by_filters_and_falls_with_the_quanta():
+    features = plan().model_copy(update={"features": {k: v for k, v in plan().features.items() if k != "ball"}})
+    features = features.model_copy(update={"measurands": features.measurands[:1]})
+    setting = task(features=features)
+    P = tilted_turn(setting)
+
+    def height(**changed: object) -> float:
+        goal = replace(setting.goal(), settings=replace(setting.settings, **changed))
+        return predicted(goal, setting.scanner, P, table(goal, P), plan=features)[1]["height"]
+
+    exact = height(exact=True)
+    assert exact / height() == pytest.approx(1.0, abs=0.35)
+    assert exact / height(exact=True, quanta=8.0e4) == pytest.approx(2.0, rel=1e-6)
 
 
 FEATURES = {

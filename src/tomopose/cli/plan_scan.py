@@ -111,6 +111,12 @@ class PartOptions:
     room: Annotated[
         float, typer.Option("--room-mm", help="By how much the reconstructed box exceeds the part on each side.")
     ] = 5.0
+    exact: Annotated[
+        bool,
+        typer.Option(
+            "--exact-uncertainty", help="Predict through SART's own steps: about a reconstruction for each length."
+        ),
+    ] = False
     manipulator: Annotated[
         Path | None,
         typer.Option("--manipulator", help="hexapod.json or robot.json: its legs or joints keep to their stroke."),
@@ -246,6 +252,7 @@ def _settings(o: Options, mu: float) -> PartSettings:
         blur=o.blur,
         sweeps=o.sweeps,
         room=o.room,
+        exact=o.exact,
         seed=o.seed,
     )
 

@@ -61,6 +61,7 @@ def plan_scan(
     limits: str | Path | None = None,
     manipulator: Hexapod | SerialRobot | None = None,
     continuous: bool = False,
+    exact_uncertainty: bool = False,
     options: Mapping[str, float] | None = None,
 ) -> ScanPlan:
     """Choose `views` table angles and plate poses that show a part best.
@@ -73,6 +74,7 @@ def plan_scan(
     manipulator: a hexapod or a robot whose legs or joints have to stay within their stroke; a robot's poses are counted
                  from its working pose, where the part lies in W, and come with their joint values.
     continuous:  whether the views lie on one smooth turn.
+    exact_uncertainty: whether u_mm is predicted through SART's own steps; about a reconstruction for each length.
     options:     of the objective and the prediction: least_transmission, tangent (rad), tuy_width (rad), margin (px),
                  quanta, readout, blur (px), sweeps, room (mm), alpha_step and tilt_step (rad), seed ...
 
@@ -86,16 +88,16 @@ def plan_scan(
     if scanner is not None and calibration is not None:
         require_same_scanner(calibration, scanner)
     given = dict(options or {})
-    unknown = sorted(set(given) - (set(PartSettings.__dataclass_fields__) - {"mu"}))
+    unknown = sorted(set(given) - (set(PartSettings.__dataclass_fields__) - {"mu", "exact"}))
     if unknown:
-        known = ", ".join(k for k in PartSettings.__dataclass_fields__ if k != "mu")
+        known = ", ".join(k for k in PartSettings.__dataclass_fields__ if k not in ("mu", "exact"))
         raise InputError(f"options: {', '.join(unknown)} is not known; {known} are")
     whole = {k: int(v) if k in ("sweeps", "seed") and float(v).is_integer() else v for k, v in given.items()}
     setting = Setting(
         scanner=scanner if calibration is None else calibration.scanner,  # type: ignore[arg-type]
         part=_part(part),
         views=views,
-        settings=PartSettings(mu=mu_per_mm, **whole),  # type: ignore[arg-type]
+        settings=PartSettings(mu=mu_per_mm, exact=exact_uncertainty, **whole),  # type: ignore[arg-type]
         features=features,
         limits=ScanLimits() if limits is None else read_limits(limits),
         calibration=calibration,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numba import njit
@@ -17,7 +18,6 @@ from scipy.special import erfc
 
 from tomopose.measurement.surface import edge_kernel as kernel
 from tomopose.measurement.surface.edges import EdgeSettings, common_sigma, fit_window
-from tomopose.planning.part.sart_response import SartResponse
 from tomopose.units import Array
 
 SIGMA_POINTS, SIGMA_ROUNDS, SIGMA_TOLERANCE = 400, 25, 0.01
@@ -25,6 +25,14 @@ SIGMA_POINTS, SIGMA_ROUNDS, SIGMA_TOLERANCE = 400, 25, 0.01
 SETTINGS = EdgeSettings()
 FEWEST_EDGES = 0.2
 """Share of a feature's points with an edge, below which nothing is said of it."""
+
+
+class Response(Protocol):
+    """Grey levels that a reconstruction makes of the part, and the size of its voxels, mm."""
+
+    @property
+    def voxel(self) -> float: ...
+    def at(self, x: Array) -> Array: ...
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,7 +56,7 @@ def _fit(profiles: np.ndarray, sigma: float, window: float, out: np.ndarray) -> 
     return good
 
 
-def _profiles(response: SartResponse, x: Array, n: Array, sigma: float) -> tuple[Array, Array, Array]:
+def _profiles(response: Response, x: Array, n: Array, sigma: float) -> tuple[Array, Array, Array]:
     """(places s (k,) in voxels, samples (m, k, 3) mm, grey levels (m, k)) along normals n from points x (m, 3)."""
     window = fit_window(SETTINGS, sigma)
     s = np.linspace(-window, window, 2 * round(window / kernel.STEP) + 1, dtype=np.float64)
@@ -61,7 +69,7 @@ def _fitted(profiles: Array, sigma: float) -> tuple[Array, np.ndarray]:
     return out, _fit(profiles, sigma, fit_window(SETTINGS, sigma), out)
 
 
-def _blur(response: SartResponse, x: Array, n: Array) -> float:
+def _blur(response: Response, x: Array, n: Array) -> float:
     """Common standard width of a feature's edges, voxels, as the measurement estimates it."""
     rows = np.linspace(0, len(x) - 1, min(len(x), SIGMA_POINTS)).astype(int)
     return common_sigma(
@@ -71,7 +79,7 @@ def _blur(response: SartResponse, x: Array, n: Array) -> float:
     )
 
 
-def expected_edges(response: SartResponse, x: Array, n: Array) -> ExpectedEdges:
+def expected_edges(response: Response, x: Array, n: Array) -> ExpectedEdges:
     """Of the points x (m, 3), mm, of one feature with unit normals n (m, 3) from material to air."""
     sigma = _blur(response, x, n)
     s, samples, profiles = _profiles(response, x, n, sigma)

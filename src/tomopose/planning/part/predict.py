@@ -5,10 +5,11 @@ measurand takes these to a length:
 
     d length = sum_f (d length / d vector_f) D_f e_f,      e_i = sum_k L_ik g_ik
 
-so that a length is one sum over grey levels of the volume, whose variance `SartResponse.covariance` gives with all
-correlation between voxels, points and the two features.  What it holds: the quanta and the readout, the views' geometry
-and transmission, blur, SART, the fit; and, with a calibration, its shared uncertainty.  What it does not hold: every
-systematic deviation (artefacts of few views and of the cone beam, beam hardening, scatter, sampling by voxels).
+so that a length is one sum over grey levels of the volume, whose variance `SartResponse.covariance` gives by filters,
+or `SartSteps.covariance` through SART's own steps, with all correlation between voxels, points and the two features.
+What it holds: the quanta and the readout, the views' geometry and transmission, blur, SART, the fit; and, with a
+calibration, its shared uncertainty.  What it does not hold: every systematic deviation (artefacts of few views and of
+the cone beam, beam hardening, scatter, sampling by voxels).
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from tomopose.measurement.measure import evaluate
 from tomopose.measurement.plan import MeasurandPlan, MeasurementPlan
 from tomopose.planning.part.expected_edges import FEWEST_EDGES, ExpectedEdges, expected_edges
 from tomopose.planning.part.sart_response import sart_response
+from tomopose.planning.part.sart_steps import sart_steps
 from tomopose.planning.part.targets import Target, probed_targets
 from tomopose.planning.part.worth import Goal, Views
 from tomopose.trajectory.completeness import source_path
@@ -106,7 +108,7 @@ def _from_noise(
     if not (depth > 0).all():
         nothing = np.full(len(targets), np.inf)
         return nothing, nothing, {m.name: np.inf for m in wanted}
-    response = sart_response(goal.part, scanner, P, goal.settings)
+    response = (sart_steps if goal.settings.exact else sart_response)(goal.part, scanner, P, goal.settings)
     edges = {t.name: expected_edges(response, t.x, t.n) for t in targets}
     rows: list[csr_array] = []
     for target in targets:

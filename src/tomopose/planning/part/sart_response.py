@@ -91,32 +91,72 @@ class SartResponse:
         return total * size**2
 
 
-def sart_response(part: Part, scanner: Scanner, P: Array, settings: PartSettings) -> SartResponse:
-    """Of views with matrices P (n, 3, 4), part at home -> pixels.  What leaves the panel is taken as if it did not."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Blocks:
+    """Images of a part that cover it with a margin, the panel's pixels taken in blocks of size x size.
+
+    P (n, 3, 4): to blocks;  tau, variance (n, n_v, n_u): transmission, and the variance of its line integral;
+    voxel: mm, a block's size at the part.
+    """
+
+    P: Array
+    tau: Array
+    variance: Array
+    size: int
+    voxel: float
+
+
+def blocks(part: Part, scanner: Scanner, P: Array, settings: PartSettings, *, corners: Array | None = None) -> Blocks:
+    """Of views with matrices P (n, 3, 4), part at home -> pixels.
+
+    The images follow the part, and what leaves the panel is taken as if it did not; with `corners` (k, 3), mm, of a
+    reconstructed box they are one part of the panel, that which the box's image fills.
+    """
     x_D = project(P, part.hull)
-    size = np.ptp(x_D, axis=1).max(axis=0)
-    block = max(math.ceil(math.sqrt(float(size.prod())) / MOST_PIXELS), 1)
-    low = np.floor((x_D.min(axis=1) - (block - 1) / 2) / block) - MARGIN
-    n_u, n_v = (int(k) for k in np.ceil(size / block) + 2 * MARGIN + 2)
+    extent = np.ptp(x_D, axis=1).max(axis=0)
+    size = max(math.ceil(math.sqrt(float(extent.prod())) / MOST_PIXELS), 1)
+    low = np.floor((x_D.min(axis=1) - (size - 1) / 2) / size) - MARGIN
+    n_u, n_v = (int(k) for k in np.ceil(extent / size) + 2 * MARGIN + 2)
+    if corners is not None:
+        panel = np.array([scanner.n_u, scanner.n_v]) // size
+        first, last = np.zeros(2), panel - 1.0
+        if (P[:, 2, :3] @ corners.T + P[:, 2, 3:] > 0).all():
+            x_D = (project(P, corners) - (size - 1) / 2) / size
+            first = np.clip(np.floor(x_D.min(axis=(0, 1))), 0, panel - 2)
+            last = np.clip(np.ceil(x_D.max(axis=(0, 1))), first + 1, panel - 1)
+        low, (n_u, n_v) = np.tile(first, (len(P), 1)), (int(k) for k in last - first + 1)
     crop = np.zeros((len(P), 3, 3))
-    crop[:, 0, 0] = crop[:, 1, 1] = 1 / block
-    crop[:, :2, 2] = -(block - 1) / 2 / block - low
+    crop[:, 0, 0] = crop[:, 1, 1] = 1 / size
+    crop[:, :2, 2] = -(size - 1) / 2 / size - low
     crop[:, 2, 2] = 1.0
     P = crop @ P
     tau = np.stack([_transmission(part, p, (n_v, n_u), settings.mu) for p in P])
-    tau = np.maximum(gaussian_filter(tau, (0, settings.blur / block, settings.blur / block)), 1e-12)
-    quanta = settings.quanta * block**2 * tau
-    padded = (fft.next_fast_len(2 * n_v, real=True), fft.next_fast_len(2 * n_u, real=True))
-    signal, noise = _filters(part, P, settings, padded)
-    spectrum = fft.rfft2(-np.log(tau), s=padded) * signal
+    tau = np.maximum(gaussian_filter(tau, (0, settings.blur / size, settings.blur / size)), 1e-12)
+    quanta = settings.quanta * size**2 * tau
     depth = float(np.mean(P[:, 2, :3] @ part.centre + P[:, 2, 3]))
-    return SartResponse(
+    return Blocks(
         P=P,
+        tau=tau,
+        variance=1 / quanta + (settings.readout * size / quanta) ** 2,
+        size=size,
+        voxel=scanner.p_u * size * depth / scanner.d_SD,
+    )
+
+
+def sart_response(part: Part, scanner: Scanner, P: Array, settings: PartSettings) -> SartResponse:
+    """Of views with matrices P (n, 3, 4), part at home -> pixels."""
+    found = blocks(part, scanner, P, settings)
+    n_v, n_u = found.tau.shape[1:]
+    padded = (fft.next_fast_len(2 * n_v, real=True), fft.next_fast_len(2 * n_u, real=True))
+    signal, noise = _filters(part, found.P, settings, padded)
+    spectrum = fft.rfft2(-np.log(found.tau), s=padded) * signal
+    return SartResponse(
+        P=found.P,
         grey=fft.irfft2(spectrum, s=padded)[:, :n_v, :n_u],
         noise=noise,
-        variance=1 / quanta + (settings.readout * block / quanta) ** 2,
+        variance=found.variance,
         padded=padded,
-        voxel=scanner.p_u * block * depth / scanner.d_SD,
+        voxel=found.voxel,
     )
 
 

@@ -46,6 +46,7 @@ class PartSettings:
     blur:               standard width of the unsharpness at the panel, px.
     sweeps, room:       of SART, and by how many mm the reconstructed box is larger than the part on each side; of the
                         predicted uncertainty too.
+    exact:              whether the prediction takes SART's steps themselves, as long as a reconstruction for each sum.
     seed:               of the random points where the whole surface is the feature.
     """
 
@@ -62,6 +63,7 @@ class PartSettings:
     blur: float = 0.5
     sweeps: int = 1
     room: float = 5.0
+    exact: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -63,6 +63,7 @@ def _constants(s: PartSettings) -> Content:
         "blur_px": s.blur,
         "sweeps": s.sweeps,
         "room_mm": s.room,
+        "exact_uncertainty": s.exact,
         "seed": s.seed,
     }
 
