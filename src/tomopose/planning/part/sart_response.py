@@ -24,6 +24,7 @@ filtered, back-projection's transpose times the variance 1 / (N_0 tau) + (r / (N
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +33,7 @@ from scipy import fft
 from scipy.ndimage import gaussian_filter
 from scipy.sparse import csr_array
 
+from tomopose.engines.cpu import processors
 from tomopose.geometry.projection import project
 from tomopose.geometry.scanner import Scanner
 from tomopose.planning.part.material_paths import material_paths
@@ -183,8 +185,13 @@ def _filters(part: Part, P: Array, settings: PartSettings, padded: tuple[int, in
     per_mm = [(P[:, k, :3] - x_D[:, k, None] * P[:, 2, :3]) / depth for k in (0, 1)]
     f = np.stack(np.meshgrid(fft.rfftfreq(padded[1]), fft.fftfreq(padded[0])), axis=-1)
     signal, noise = np.empty((2, n, *f.shape[:2]))
-    how = RELAXATION, settings.sweeps
-    _fill(f, np.stack(per_mm, axis=1), d, _chords(part, s, settings.room), place, how, signal, noise)
+    how, D, steps = (RELAXATION, settings.sweeps), _chords(part, s, settings.room), np.stack(per_mm, axis=1)
+
+    def fill(j: int) -> None:
+        _fill(j, f, steps, d, D, place, how, signal[j], noise[j])
+
+    with ThreadPoolExecutor(processors()) as pool:
+        list(pool.map(fill, range(n)))
     return signal, noise
 
 
@@ -230,6 +237,7 @@ def _of_wave(share: np.ndarray, B2: float, place: np.ndarray, j: int, how: tuple
 
 @njit(cache=True, nogil=True)
 def _fill(
+    j: int,
     f: np.ndarray,
     per_mm: np.ndarray,
     d: np.ndarray,
@@ -239,18 +247,17 @@ def _fill(
     signal: np.ndarray,
     noise: np.ndarray,
 ) -> None:
-    """Write the filters of all views: f (a, b, 2) 1/px, per_mm (n, 2, 3) px/mm, directions d (n, 3), chords D (n,)."""
+    """Write the filters (a, b) of view j: f (a, b, 2) 1/px, per_mm (n, 2, 3) px/mm, d (n, 3), chords D (n,)."""
     n = len(d)
     share = np.empty(n)
-    for j in range(n):
-        for a in range(f.shape[0]):
-            for b in range(f.shape[1]):
-                k = f[a, b, 0] * per_mm[j, 0] + f[a, b, 1] * per_mm[j, 1]
-                B2 = (_sinc(f[a, b, 0]) * _sinc(f[a, b, 1])) ** 4
-                for i in range(n):
-                    share[i] = _sinc_2(D[i] * (k[0] * d[i, 0] + k[1] * d[i, 1] + k[2] * d[i, 2]))
-                H, N = _of_wave(share, B2, place, j, how)
-                signal[j, a, b], noise[j, a, b] = H / D[j], N / D[j]
+    for a in range(f.shape[0]):
+        for b in range(f.shape[1]):
+            k = f[a, b, 0] * per_mm[j, 0] + f[a, b, 1] * per_mm[j, 1]
+            B2 = (_sinc(f[a, b, 0]) * _sinc(f[a, b, 1])) ** 4
+            for i in range(n):
+                share[i] = _sinc_2(D[i] * (k[0] * d[i, 0] + k[1] * d[i, 1] + k[2] * d[i, 2]))
+            H, N = _of_wave(share, B2, place, j, how)
+            signal[a, b], noise[a, b] = H / D[j], N / D[j]
 
 
 @njit(cache=True, nogil=True)
