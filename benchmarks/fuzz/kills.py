@@ -1,16 +1,19 @@
 """Kill programs that write at random moments: what they leave is the whole old result or the whole new one.
 
-    python benchmarks/fuzz/kills.py --kills 200 --seed 1 [--only calibrate,export]
+    python benchmarks/fuzz/kills.py --kills 200 --seed 1 [--only calibrate,export] [--log kills.jsonl]
 
 Four writers of the library and the verbs of `verbs.py` take turns.  A program writes two states of a result in turn,
 over and over, until a signal (KILL, TERM or INT) ends it.  Then the result must be one of the two, the next run must
-succeed, and nothing of the killed one may stay beside it.
+succeed, and nothing of the killed one may stay beside it.  Each kill has a generator of its own, and its row is printed
+as it is found: with --log, an interrupted run continues after the last row.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import hashlib
+import json
 import os
 import random
 import signal
@@ -159,25 +162,41 @@ def left_by(name: str, place: Path, states: list[dict[str, str]], number: signal
     return "resumed" if found not in states else "new" if found == states[writing] else "old"
 
 
+def read_log(path: Path | None) -> list[dict[str, object]]:
+    """The kills of an interrupted run; a line that was cut off is repeated."""
+    rows: list[dict[str, object]] = []
+    for line in path.read_text().splitlines() if path is not None and path.exists() else ():
+        with contextlib.suppress(ValueError):
+            rows.append(json.loads(line))
+    return rows
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default="", help="writers by name, as a,b; default: all")
+    parser.add_argument("--log", type=Path, help="a line for each kill; those in it are not repeated")
     args = parser.parse_args()
     wanted = [name for name in WRITERS if not args.only or name in args.only.split(",")]
+    done = read_log(args.log)
     prepare(INPUTS)
-    rng = random.Random(args.seed)
     found: dict[str, Counter[str]] = {name: Counter() for name in wanted}
     signals: Counter[str] = Counter()
     for k in range(args.kills):
-        name = wanted[k % len(wanted)]
-        with tempfile.TemporaryDirectory() as root:
-            number, what = kill_once(name, Path(root), rng)
-        found[name][what] += 1
-        signals[number] += 1
-        if what not in GOOD:
-            print(f"{name}, {number}: {what}", flush=True)
+        row = {"seed": args.seed, "kill": k, "writer": wanted[k % len(wanted)]}
+        before = next((r for r in done if row.items() <= r.items()), None)
+        if before is None:
+            began = time.monotonic()
+            with tempfile.TemporaryDirectory() as root:
+                number, what = kill_once(str(row["writer"]), Path(root), random.Random(f"{args.seed} {k}"))
+            before = {**row, "signal": number, "left": what, "s": round(time.monotonic() - began, 1)}
+            print(json.dumps(before), flush=True)
+            if args.log:
+                with args.log.open("a") as log:
+                    log.write(json.dumps(before) + "\n")
+        found[str(row["writer"])][str(before["left"])] += 1
+        signals[str(before["signal"])] += 1
     print(f"{'writer':14s} whole old  whole new    resumed  a mixture or worse")
     found["all"] = sum(found.values(), Counter())
     for name, count in found.items():
