@@ -10,9 +10,13 @@ from calibration_cases import BALL, MOUNT, SCANNER, mixed_poses, observe, paper_
 
 from tomopose.calibration.checks.conventions.alternatives import ALTERNATIVES
 from tomopose.calibration.checks.conventions.diagnose import diagnose
+from tomopose.calibration.checks.conventions.fits import FIRST_ROWS, Reading
 from tomopose.calibration.model.problem import pair
+from tomopose.calibration.model.silhouettes import Cameras
+from tomopose.calibration.rigid.start import ray_equations
 from tomopose.calibration.solve import calibrate
 from tomopose.geometry.frames import Frame
+from tomopose.geometry.projection import project_ball
 from tomopose.geometry.rotations import rotation_from_convention
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.manipulator.poses import PoseSequence
@@ -187,3 +191,22 @@ def test_a_wrong_convention_is_found_under_drift(name, course):
     better = diagnose(SCANNER, poses, observed).better
     assert name in {h.name for h in better[:2]}
     assert calibrate(SCANNER, poses, observed).verdict == "rejected"
+
+
+def test_an_alternative_of_many_balls_is_fitted_to_some_rows_of_each_first():
+    balls, poses, rng = 3, 2 * FIRST_ROWS + 5, np.random.default_rng(2)
+    x, angles = rng.uniform(-9, 9, (poses, 3)), rng.uniform(-6, 6, (poses, 3))
+    ball, alpha = np.tile(np.arange(balls), poses), rng.choice([0.0, np.pi / 2], poses)
+    several = (np.repeat(a, balls, axis=0) for a in (x, angles))
+    table = PoseSequence.from_table(*several, alpha=np.repeat(alpha, balls), ball_id=ball)
+    t = np.array([[8.0, -6.0, 17.0], [-11.0, 4.0, 3.0], [2.0, 9.0, -8.0]])[ball]
+    x_D = project_ball(SCANNER, T_HT=MOUNT, T_MH=table.T_MH, t=t, alpha=table.alpha)
+    x_D = x_D * [1, -1] + [0, SCANNER.n_v - 1] + rng.normal(0, 0.0146, x_D.shape)
+    flipped = BallObservations.from_sigma(x_D, 0.0146, pose_id=table.pose_id)
+    problem = pair(SCANNER, table, flipped)
+    cameras = Cameras.of(problem)
+    first = Reading.of(problem, cameras, ray_equations(problem, cameras), thoroughly=False)
+    assert np.bincount(problem.ball[first.rows]).tolist() == [FIRST_ROWS] * balls
+    found = calibrate(SCANNER, table, flipped)
+    assert found.hypotheses[0].name == "rows flipped"
+    assert found.verdict == "rejected"

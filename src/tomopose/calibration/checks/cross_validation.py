@@ -44,6 +44,11 @@ def _flat(A: Array) -> Array:
     return A.reshape(-1, A.shape[2])
 
 
+def _gram(A: Array) -> Array:
+    """(m, m): the inner products of the columns of A (k, m)."""
+    return np.asarray(A.T @ A)
+
+
 def held_out(fit: LinearFit) -> HeldOut:
     """Cross-validate a fit on the rows that it used."""
     n, m = len(fit.problem), fit.J.shape[2]
@@ -51,11 +56,11 @@ def held_out(fit: LinearFit) -> HeldOut:
     fewest = 2 * (n - max((len(part) for part in parts), default=n)) + len(fit.prior_rows)
     if fewest <= m:
         return HeldOut(rms=float("nan"), chi2=float("nan"), log_predictive=float("nan"))
-    A, r, W = fit.J_white, fit.r_white, fit.W
+    r, W = fit.r_white, fit.W
     log_predictive, chi2 = float(np.sum(np.log(np.einsum("nii->ni", W)))), 0.0
     scale = 1.0 / np.sqrt(np.maximum(np.diag(fit.information), 1e-300))
     information = fit.information * scale[:, None] * scale
-    gram = np.array([_flat(A[part]).T @ _flat(A[part]) for part in parts]) * scale[:, None] * scale
+    gram = np.array([_gram(_flat(fit.J_white(part))) for part in parts]) * scale[:, None] * scale
     # V = I + A_b S_b A_b' has as many rows as the block; what is needed of it has as many as there are parameters.
     value, axes = np.linalg.eigh(information - gram)
     seen = value > 1e-14 * np.abs(value).max(axis=1, keepdims=True)
@@ -63,7 +68,7 @@ def held_out(fit: LinearFit) -> HeldOut:
     log_det = np.linalg.slogdet(np.eye(m) + np.swapaxes(root, 1, 2) @ gram @ root)[1]
     missed = []
     for part, S in zip(parts, scale[:, None] * root, strict=True):
-        A_b, r_b = _flat(A[part]), r[part].ravel()
+        A_b, r_b = _flat(fit.J_white(part)), r[part].ravel()
         missed.append(r_b + A_b @ (S @ (S.T @ (A_b.T @ r_b))))
         chi2 += float(r_b @ missed[-1])
     log_predictive -= 0.5 * (chi2 + float(log_det.sum()))

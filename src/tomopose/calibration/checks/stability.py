@@ -248,7 +248,7 @@ def chi2_with_movements(problem: Problem, free: FreeParameters, fit: Fit, moved:
     n = len(problem)
     tau = elapsed(problem) / max(float(elapsed(problem).max()), 1e-300)
     steps = {name: J for name, _, J in _steps(at, fit.R_HT)}
-    columns = [at.J_white.reshape(2 * n, -1)]
+    columns = [at.J_white().reshape(2 * n, -1)]
     for e in moved:
         if e.at:
             late = np.arange(n) >= problem.pose_id.index(e.at)

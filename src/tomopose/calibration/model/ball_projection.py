@@ -253,6 +253,10 @@ class ProjectionBlocks:
     R_MH: Array
     G_H: Array
 
+    def rows(self, some: slice) -> ProjectionBlocks:
+        """Of some of the poses."""
+        return ProjectionBlocks(**{name: value[some] for name, value in vars(self).items()})
+
     @property
     def J_pose_left(self) -> Array:
         """(n, 2, 6) by (rho, w) of T_MH <- Exp(rho, w) T_MH: x_H moves by rho + w x x_H.  mm, rad, along H."""

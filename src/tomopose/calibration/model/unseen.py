@@ -21,6 +21,7 @@ from tomopose.calibration.model.assumed import (
     WOBBLE_RAD,
 )
 from tomopose.calibration.model.ball_projection import ProjectionBlocks
+from tomopose.calibration.model.tall import ByBall, parts
 from tomopose.geometry.rotations import R_z, log_rotation
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
@@ -132,18 +133,10 @@ def unseen_columns(
     return np.stack(columns, axis=2) if columns else np.zeros((*b.x_D.shape, 0))
 
 
-def unseen_gain(names: tuple[str, ...], sigma: Array, covariance: Array, J: Array, V: Array, C: Array) -> Unseen:
-    """K from the estimate's covariance (m, m), Jacobian J (n, 2, m), covariances V (n, 2, 2) of the centres and columns
-    C (n, 2, c); sigma (c,): priors."""
-    weighted = np.linalg.solve(V, C)
-    gain = covariance @ np.einsum("nim,nic->mc", J, weighted)
-    return Unseen(names=names, sigma=sigma, gain=gain)
-
-
 def unseen_of(
     b: ProjectionBlocks,
     covariance: Array,
-    J: Array,
+    J: Array | ByBall,
     V: Array,
     *,
     T_HT: RigidTransform,
@@ -160,5 +153,9 @@ def unseen_of(
     """
     turned = largest_turn(b.R_MH)
     names = unseen_names(turned, table=not moving_scanner, translations=not scale_known)
-    C = unseen_columns(names, b, T_HT=T_HT, origin=origin, alpha=alpha, about_H=moving_scanner)
-    return unseen_gain(names, unseen_sigma(names, robot=turned > PLATFORM_RAD, measured=measured), covariance, J, V, C)
+    seen = np.zeros((J.shape[2], len(names)))
+    for p in parts(len(J)):
+        C = unseen_columns(names, b.rows(p), T_HT=T_HT, origin=origin[p], alpha=alpha[p], about_H=moving_scanner)
+        seen += np.einsum("nim,nic->mc", J[p], np.linalg.solve(V[p], C))
+    sigma = unseen_sigma(names, robot=turned > PLATFORM_RAD, measured=measured)
+    return Unseen(names=names, sigma=sigma, gain=covariance @ seen)

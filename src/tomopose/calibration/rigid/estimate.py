@@ -11,10 +11,11 @@ from tomopose.calibration.model.covariance import inverse_information, significa
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import UNITS, FreeParameters, free_parameters
 from tomopose.calibration.model.problem import POSITION_UNITS, Problem
+from tomopose.calibration.model.tall import ByBall, is_tall
 from tomopose.calibration.rigid.fit import (
     Fit,
     blocks,
-    jacobian,
+    derivatives,
     linearised,
     minimise,
     residuals,
@@ -80,7 +81,7 @@ def _prior_rows(free: FreeParameters, m: int) -> Array:
     return rows[free.information > 0]
 
 
-def require_observable(problem: Problem, free: FreeParameters, J: Array) -> None:
+def require_observable(problem: Problem, free: FreeParameters, J: Array | ByBall) -> None:
     """NotObservableError, in words, where data and priors together leave a direction unknown.  J (n, 2, m), px."""
     names = tangent_names(problem.ball_ids, free)
     whitened = np.concatenate([whitened_columns(problem, J), _prior_rows(free, J.shape[2])])
@@ -131,7 +132,7 @@ def require_length(problem: Problem, fit: Fit) -> None:
 class Solution:
     """A robust fit with all that the later steps need.
 
-    problem, used: all rows, and those not set aside;  at: projection of the rows used.
+    problem, used: all rows, and those not set aside;  kept: projection of the rows used, where they are not very many.
     chi2: by the covariances that were used;  covariance: (m, m), widened by the rule in `uncertainty`.
     noise: the pose noise that the covariances include, or None.
     """
@@ -141,7 +142,7 @@ class Solution:
     noise: PoseNoise | None
     free: FreeParameters
     robust: RobustFit
-    at: ProjectionBlocks
+    kept: ProjectionBlocks | None
     chi2: float
     dof: int
     covariance: Array
@@ -151,6 +152,11 @@ class Solution:
         return self.robust.fit
 
     @property
+    def at(self) -> ProjectionBlocks:
+        """Projection of the rows used."""
+        return blocks(self.used, self.free, self.fit) if self.kept is None else self.kept
+
+    @property
     def x_calc(self) -> Array:
         """(used, 2) px."""
         return self.at.x_D
@@ -158,7 +164,8 @@ class Solution:
     @property
     def linear(self) -> LinearFit:
         """The fit of the rows used, as the checks look at it: calculated anew, since of many balls it is large."""
-        return linearised(self.used, self.free, self.fit, self.at, jacobian(self.used, self.free, self.at))
+        at = self.at
+        return linearised(self.used, self.free, self.fit, at, derivatives(self.used, self.free, at))
 
     def at_all_rows(self) -> ProjectionBlocks:
         """Projection of all rows, those set aside included."""
@@ -184,7 +191,7 @@ def solve(
     require_length(problem, first)
     everything = np.ones(len(problem), dtype=bool)
     b = blocks(problem, free, first)
-    J = jacobian(problem, free, b)
+    J = derivatives(problem, free, b)
     # judged by detection noise alone: pose noise as large as a mistake would hide behind "not observable"
     if noise is None:
         require_observable(problem, free, J)
@@ -196,7 +203,7 @@ def solve(
     used = problem.select(result.keep)
     if result.fit is not first or used is not problem:
         b = blocks(used, free, result.fit)
-        J = jacobian(used, free, b)
+        J = derivatives(used, free, b)
     if noise is None and not result.keep.all():
         require_observable(used, free, J)
     dof = 2 * len(used) + int((free.information > 0).sum()) - J.shape[2]
@@ -209,7 +216,7 @@ def solve(
         noise=noise,
         free=free,
         robust=result,
-        at=b,
+        kept=None if is_tall(2 * len(used)) else b,
         chi2=chi2,
         dof=dof,
         covariance=inverse_information(result.fit.N) * widening(chi2, dof),
@@ -261,7 +268,7 @@ def with_pose_noise(
 
 def _posterior(used: Problem, solution: Solution, maker: Repeatability | None) -> PoseNoise:
     free, at = solution.free, solution.at
-    J = jacobian(solution.used, free, at)
+    J = derivatives(solution.used, free, at)
     known = np.zeros(J.shape[2] - len(free))
     return estimate_pose_noise(
         used.covariance,

@@ -15,6 +15,7 @@ from tomopose.calibration.model.ball_projection import (
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, translation_scale
 from tomopose.calibration.model.problem import Problem
+from tomopose.calibration.model.tall import ByBall, is_tall
 from tomopose.calibration.rigid.kernel import (
     DAMPING,
     NEAR_DAMPING,
@@ -145,6 +146,30 @@ def blocks(problem: Problem, free: FreeParameters, fit: Fit) -> ProjectionBlocks
     )
 
 
+def _by_freed(problem: Problem, free: FreeParameters, b: ProjectionBlocks) -> Array:
+    """(n, 2, f): derivatives of the calculated centres by the freed parameters, px."""
+    J: Array = b.J_scanner[:, :, free.cols] * free.factor
+    if (free.col_run >= 0).any():
+        mine = (free.col_run[None, :] < 0) | (free.col_run[None, :] == problem.run[:, None])
+        J *= mine[:, None, :]
+    return J
+
+
+def derivatives(problem: Problem, free: FreeParameters, b: ProjectionBlocks) -> Array | ByBall:
+    """(n, 2, m): derivatives of the calculated centres, as of `jacobian`; of very many centres of several balls what of
+    them is not zero."""
+    if len(problem.ball_ids) == 1 or not is_tall(2 * len(problem)):
+        return jacobian(problem, free, b)
+    return ByBall(
+        w_HT=b.J_w_HT,
+        t_HT=b.J_t_HT,
+        own=b.J_t,
+        freed=_by_freed(problem, free, b),
+        ball=problem.ball,
+        balls=len(problem.ball_ids),
+    )
+
+
 def jacobian(problem: Problem, free: FreeParameters, b: ProjectionBlocks) -> Array:
     """(n, 2, m): derivatives of the calculated centres by w_HT, t_HT, the balls and the freed parameters, px."""
     n, free_from = len(problem), 6 + 3 * len(problem.ball_ids)
@@ -155,20 +180,17 @@ def jacobian(problem: Problem, free: FreeParameters, b: ProjectionBlocks) -> Arr
     else:
         column = 6 + 3 * problem.ball[:, None] + np.arange(3)
         np.put_along_axis(J, np.broadcast_to(column[:, None, :], (n, 2, 3)), b.J_t, axis=2)
-    J[:, :, free_from:] = b.J_scanner[:, :, free.cols] * free.factor
-    if (free.col_run >= 0).any():
-        mine = (free.col_run[None, :] < 0) | (free.col_run[None, :] == problem.run[:, None])
-        J[:, :, free_from:] *= mine[:, None, :]
+    J[:, :, free_from:] = _by_freed(problem, free, b)
     return J
 
 
 def linear_fit(problem: Problem, free: FreeParameters, fit: Fit) -> LinearFit:
     """The fit with its residuals, derivatives and priors, as the checks look at it."""
     b = blocks(problem, free, fit)
-    return linearised(problem, free, fit, b, jacobian(problem, free, b))
+    return linearised(problem, free, fit, b, derivatives(problem, free, b))
 
 
-def linearised(problem: Problem, free: FreeParameters, fit: Fit, b: ProjectionBlocks, J: Array) -> LinearFit:
+def linearised(problem: Problem, free: FreeParameters, fit: Fit, b: ProjectionBlocks, J: Array | ByBall) -> LinearFit:
     """The same of a fit whose projection b and derivatives J (n, 2, m) are known."""
     m, stated = J.shape[2], np.flatnonzero(free.information > 0)
     root = np.sqrt(free.information[stated])

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from tomopose.calibration.model.parameters import MATTERS, FreeParameters, base_name, unit_of
 from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.model.tall import is_tall, parts, triangle
+from tomopose.calibration.model.tall import ByBall, is_tall, parts, triangle
 from tomopose.calibration.rigid.fit import tangent_names
 from tomopose.units import Array
 from tomopose.values import value
@@ -178,7 +178,7 @@ def assumed_report(problem: Problem, J_assumed: Array, J: Array, names: tuple[st
     return tuple(sentences)
 
 
-def whitened_columns(problem: Problem, *J: Array) -> Array:
+def whitened_columns(problem: Problem, *J: Array | ByBall) -> Array:
     """(k, m): derivatives (n, 2, m_i) px in standard deviations, side by side; of very many rows, vectors with the same
     inner products."""
 
@@ -192,7 +192,7 @@ def whitened_columns(problem: Problem, *J: Array) -> Array:
 
 
 def observability(
-    problem: Problem, free: FreeParameters, J: Array, J_assumed: Array, assumed: tuple[str, ...]
+    problem: Problem, free: FreeParameters, J: Array | ByBall, J_assumed: Array, assumed: tuple[str, ...]
 ) -> Observability:
     """The report of a fit; J (n, 2, m) and J_assumed (n, 2, a) in px, without priors."""
     names = tangent_names(problem.ball_ids, free)

@@ -16,7 +16,8 @@ import numpy.typing as npt
 from tomopose.calibration.model.covariance import inverse_information, median
 from tomopose.calibration.model.parameters import FreeParameters
 from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.rigid.fit import Fit, blocks, jacobian, minimise, residuals, whitened2
+from tomopose.calibration.model.tall import ByBall, parts
+from tomopose.calibration.rigid.fit import Fit, blocks, derivatives, minimise, residuals, whitened2
 from tomopose.units import Array
 
 FALSE_ALARM = 0.01
@@ -63,13 +64,17 @@ def limit_beside(found: Array, n: int) -> float:
     return min(limit(n), 2.0 * s / (s - 1.0) * math.log(s * (1.0 - p) / p))
 
 
-def studentised(problem: Problem, fit: Fit, keep: npt.NDArray[np.bool_], x_calc: Array, J: Array) -> Array:
+def studentised(problem: Problem, fit: Fit, keep: npt.NDArray[np.bool_], x_calc: Array, J: Array | ByBall) -> Array:
     """(n,) squared residuals in their own predicted standard deviations.  Rows not kept count as predictions.
 
     x_calc (n, 2) px and J (n, 2, m): calculated centres and their derivatives at the fit.
     """
     r = problem.x_D - x_calc
-    spread = J @ inverse_information(fit.N) @ np.swapaxes(J, 1, 2)
+    covariance = inverse_information(fit.N)
+    spread: Array = np.empty((len(r), 2, 2))
+    for p in parts(len(r)):
+        some = J[p]
+        spread[p] = some @ covariance @ np.swapaxes(some, 1, 2)
     V = problem.covariance + np.where(keep[:, None, None], -spread, spread)
     V = problem.W @ V @ np.swapaxes(problem.W, 1, 2)
     y_0, y_1 = (problem.W @ r[:, :, None])[..., 0].T
@@ -91,7 +96,13 @@ def _scale(distance2: Array) -> float:
 
 
 def robust_fit(
-    problem: Problem, free: FreeParameters, start: Fit, x_calc: Array, J: Array, *, before: RobustFit | None = None
+    problem: Problem,
+    free: FreeParameters,
+    start: Fit,
+    x_calc: Array,
+    J: Array | ByBall,
+    *,
+    before: RobustFit | None = None,
 ) -> RobustFit:
     """The fit without the rows that do not belong, from the ordinary fit `start`; x_calc, J: of it, as of
     `studentised`;  before: of the same rows with other covariances, whose outliers are tried first."""
@@ -110,7 +121,7 @@ def robust_fit(
             break
         fit = minimise(problem, free, fit, weight=keep.astype(float))
         b = blocks(problem, free, fit)
-        d2 = studentised(problem, fit, keep, b.x_D, jacobian(problem, free, b))
+        d2 = studentised(problem, fit, keep, b.x_D, derivatives(problem, free, b))
         scale = _scale(d2[keep])
         unit = max(1.0, scale)
         new_keep = d2 <= limit_beside(d2[d2 > limit(n) * unit] / unit, n) * unit

@@ -19,11 +19,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
 
 from tomopose.calibration.model.ball_projection import ProjectionBlocks
+from tomopose.calibration.model.tall import ByBall
 from tomopose.geometry.rotations import skew
 from tomopose.manipulator.real_poses import Repeatability
 from tomopose.units import Array
@@ -74,14 +76,29 @@ def total_covariance(covariance: Array, b: ProjectionBlocks, noise: PoseNoise) -
 
 @njit(cache=True, error_model="numpy")
 def _minus_2_log_likelihood(
-    C: Array, A: Array, B: Array, J: Array, r: Array, information: Array, pull: Array, s_t: float, s_w: float
+    C: Array,
+    A: Array,
+    B: Array,
+    J: Array,
+    ball: Any,
+    r: Array,
+    information: Array,
+    pull: Array,
+    s_t: float,
+    s_w: float,
 ) -> float:
-    """See the module; J (n, 2, m), information (m,) of the priors, pull (m,) = P^-1 d."""
-    n, m = J.shape[0], J.shape[2]
+    """See the module; J (n, 2, w), information (m,) of the priors, pull (m,) = P^-1 d.
+
+    Columns 6 to 8 of J belong to the row's own ball (n,) where w < m; the other w - 9 follow those of all balls.
+    """
+    n, w, m = J.shape[0], J.shape[2], information.shape[0]
+    where = np.arange(w)
+    for i in range(9, w):
+        where[i] = m - w + i
     N, g = np.zeros((m, m)), np.zeros(m)
     total = 0.0
     a, b = s_t * s_t, s_w * s_w
-    p, q = np.empty(m), np.empty(m)
+    p, q = np.empty(w), np.empty(w)
     for k in range(n):
         v00 = C[k, 0, 0] + a * A[k, 0, 0] + b * B[k, 0, 0]
         v01 = C[k, 0, 1] + a * A[k, 0, 1] + b * B[k, 0, 1]
@@ -93,14 +110,21 @@ def _minus_2_log_likelihood(
         x = r[k, 0] * i00
         y = (r[k, 1] - l10 * x) * i11
         total += x * x + y * y
-        for i in range(m):
+        if w < m:
+            for i in range(3):
+                where[6 + i] = 6 + 3 * ball[k] + i
+        for i in range(w):
             p[i] = J[k, 0, i] * i00
             q[i] = (J[k, 1, i] - l10 * p[i]) * i11
-            g[i] += p[i] * x + q[i] * y
-        for i in range(m):
-            p_i, q_i = p[i], q[i]
-            for j in range(i + 1):
-                N[i, j] += p_i * p[j] + q_i * q[j]
+            g[where[i]] += p[i] * x + q[i] * y
+        for i in range(w):
+            p_i, q_i, wi = p[i], q[i], where[i]
+            if w == m:  # every unknown is at its own place: the same sums, written without a detour
+                for j in range(i + 1):
+                    N[i, j] += p_i * p[j] + q_i * q[j]
+            else:
+                for j in range(i + 1):
+                    N[wi, where[j]] += p_i * p[j] + q_i * q[j]
     for i in range(m):
         N[i, i] += information[i]
         g[i] -= pull[i]
@@ -127,10 +151,23 @@ def _grid(unit: float, most: float) -> Array:
     return np.asarray(unit * np.concatenate([[0.0], np.geomspace(0.08, most, STEPS - 1)]))
 
 
+def _own_columns(J: Array | ByBall) -> tuple[Array, Any, Array, Any]:
+    """J (n, 2, w) of the columns that a row may answer to, ball (n,) of each row, the squares of all columns (m,), and
+    where those w of a row are among them, (w,) or (n, 1, w)."""
+    if not isinstance(J, ByBall):
+        return J, np.zeros(len(J), dtype=np.int64), np.einsum("nim,nim->m", J, J), np.arange(J.shape[2])
+    n, m = len(J), J.shape[2]
+    own = np.concatenate([J.w_HT, J.t_HT, J.own, J.freed], axis=2)
+    where = np.broadcast_to(np.r_[:9, 6 + 3 * J.balls : m], (n, own.shape[2])).copy()
+    where[:, 6:9] += 3 * J.ball[:, None]
+    squares = np.bincount(where.ravel(), weights=(own**2).sum(axis=1).ravel(), minlength=m)
+    return own, J.ball, squares, where[:, None, :]
+
+
 def estimate_pose_noise(
     covariance: Array,
     b: ProjectionBlocks,
-    J: Array,
+    J: Array | ByBall,
     r: Array,
     *,
     information: Array | None = None,
@@ -147,12 +184,14 @@ def estimate_pose_noise(
     known = np.zeros(m) if information is None else np.asarray(information, dtype=np.float64)
     pull = np.zeros(m) if deviation is None else known * deviation
     A, B = pose_spread(b)
-    scale = 1.0 / np.sqrt(np.maximum(np.einsum("nim,nim->m", J, J) + known, 1e-300))
-    arrays = tuple(np.ascontiguousarray(v) for v in (covariance, A, B, J * scale, r, known * scale**2, pull * scale))
+    J, ball, squares, where = _own_columns(J)
+    scale = 1.0 / np.sqrt(np.maximum(squares + known, 1e-300))
+    given = (covariance, A, B, J * scale[where], ball, r, known * scale**2, pull * scale)
+    arrays = tuple(np.ascontiguousarray(v) for v in given)
 
     def objective(s_t: float, s_w: float) -> float:
-        C, a, c, J_s, r_k, known_s, pull_s = arrays
-        return float(_minus_2_log_likelihood(C, a, c, J_s, r_k, known_s, pull_s, s_t, s_w))
+        C, a, c, J_s, own, r_k, known_s, pull_s = arrays
+        return float(_minus_2_log_likelihood(C, a, c, J_s, own, r_k, known_s, pull_s, s_t, s_w))
 
     noise = float(np.mean(np.trace(covariance, axis1=1, axis2=2)))
     # the largest scatter that is tried: the whole of the residuals, four times over

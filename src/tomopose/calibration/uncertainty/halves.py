@@ -74,7 +74,7 @@ def _normal_equations(linear: LinearFit, rows: np.ndarray) -> tuple[Array, Array
     m = linear.J.shape[2]
     F, g = np.zeros((m, m)), np.zeros(m)
     for part in parts(len(rows)):
-        A, r = linear.J_white[rows[part]].reshape(-1, m), linear.r_white[rows[part]].ravel()
+        A, r = linear.J_white(rows[part]).reshape(-1, m), linear.r_white[rows[part]].ravel()
         F += A.T @ A
         g += A.T @ r
     return F, g

@@ -156,7 +156,7 @@ def _with_two_angles(
         return None
     J = np.concatenate([b.J_mount, b.J_t, b.J_scanner[:, :, scanner_part]], axis=2)
     turned = (linear.W @ J).reshape(-1, J.shape[2])
-    now = linear.J_white.reshape(-1, J.shape[2])
+    now = linear.J_white().reshape(-1, J.shape[2])
     N = (now.T @ now + turned.T @ turned) / 2 + linear.prior_rows.T @ linear.prior_rows
     m = len(calibration.tangent)
     C = inverse_information(N)

@@ -7,7 +7,8 @@ it; how two readings compare, and what is advised, is in `hypothesis`.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,6 +47,9 @@ from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.units import Array
 from tomopose.values import require_types
+
+ROWS_AT_ONCE = 1 << 17
+"""Rows that the alternatives held together have: some 40 MB of poses and rays."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,23 +128,26 @@ def ranked(
     x_T = balls_in_table(problem, fit)
     declared = _Declared(problem=problem, free=free, fit=fit, x_T=x_T, cameras=cameras)
     hopeless = HOPELESS * max(fit.chi2, float(declared.own.dof))
-    tried: list[tuple[Alternative, Reading]] = []
-    for alternative in alternatives:
-        changed = alternative.change(problem)
-        if changed is None or declared.dof(changed) <= 0:
-            continue
-        same_table = changed.alpha is problem.alpha
-        seen_by = cameras if same_table else Cameras.of(changed)
-        of_changed = rays if same_table and changed.x_D is problem.x_D else ray_equations(changed, seen_by)
-        tried.append((alternative, Reading.of(changed, seen_by, of_changed, thoroughly=starts > 0)))
-    found = [declared.own]
-    for (alternative, one), start in zip(tried, linear_starts([one for _, one in tried]), strict=True):
-        other = fitted(one, start, free, held, starts=starts, hopeless=hopeless)
-        if not np.isfinite(other.fit.chi2):
-            continue
-        judged = _judged_beside_movements(declared, alternative, one, other)
-        if judged is not None:
-            found.append(judged)
+
+    def readings() -> Iterator[tuple[Alternative, Reading]]:
+        for alternative in alternatives:
+            changed = alternative.change(problem)
+            if changed is None or declared.dof(changed) <= 0:
+                continue
+            same_table = changed.alpha is problem.alpha
+            seen_by = cameras if same_table else Cameras.of(changed)
+            of_changed = rays if same_table and changed.x_D is problem.x_D else ray_equations(changed, seen_by)
+            yield alternative, Reading.of(changed, seen_by, of_changed, thoroughly=starts > 0)
+
+    found, left = [declared.own], readings()
+    while tried := list(itertools.islice(left, max(1, ROWS_AT_ONCE // len(problem)))):
+        for (alternative, one), start in zip(tried, linear_starts([one for _, one in tried]), strict=True):
+            other = fitted(one, start, free, held, starts=starts, hopeless=hopeless)
+            if not np.isfinite(other.fit.chi2):
+                continue
+            judged = _judged_beside_movements(declared, alternative, one, other)
+            if judged is not None:
+                found.append(judged)
     return Diagnosis(hypotheses=rank(found))
 
 

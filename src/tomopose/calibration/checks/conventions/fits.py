@@ -30,8 +30,8 @@ ITERATIONS = 20
 """An alternative that is right needs fewer; one that is wrong is not worth more."""
 
 FIRST_ROWS, HOPELESS = 48, 100.0
-"""Where there are more than twice as many rows, an alternative is fitted to so many of them first; one that then leaves
-so many times the declared reading's chi2 (or dof) in all rows is wrong, and is not fitted to all of them."""
+"""Where a ball has more than twice as many rows, an alternative is fitted to so many of each ball first; one that then
+leaves so many times the declared reading's chi2 (or dof) in all rows is wrong, and is not fitted to all of them."""
 
 PASSING = 1e-4
 """Last step, in standard deviations, of a fit that another one starts from or that is hopeless."""
@@ -88,10 +88,16 @@ def size_ratio(problem: Problem, free: FreeParameters, fit: Fit, x_T: Array, cam
 
 @functools.lru_cache(maxsize=16)
 def _spread(n: int) -> npt.NDArray[np.int64]:
-    """FIRST_ROWS rows, spread evenly over n."""
-    rows = np.unique(np.linspace(0, n - 1, FIRST_ROWS).round().astype(np.int64))
+    """FIRST_ROWS rows, spread evenly over n, or all where they are fewer."""
+    rows = np.unique(np.linspace(0, n - 1, min(n, FIRST_ROWS)).round().astype(np.int64))
     rows.flags.writeable = False
     return rows
+
+
+def _spread_of_each(ball: npt.NDArray[np.int64], balls: int) -> npt.NDArray[np.int64]:
+    """FIRST_ROWS rows of each ball, spread evenly over its rows; ball (n,): index of each row's."""
+    own = np.split(np.argsort(ball, kind="stable"), np.cumsum(np.bincount(ball, minlength=balls))[:-1])
+    return np.sort(np.concatenate([rows[_spread(len(rows))] for rows in own]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,9 +112,12 @@ class Reading:
     @classmethod
     def of(cls, problem: Problem, cameras: Cameras, rays: Rays, *, thoroughly: bool) -> Reading:
         """With all rows first where they are few, or where it is to be thorough."""
-        n = len(problem)
-        few = thoroughly or n <= 2 * FIRST_ROWS or len(problem.ball_ids) > 1
-        return cls(problem=problem, cameras=cameras, rays=rays, rows=np.arange(n) if few else _spread(n))
+        n, balls = len(problem), len(problem.ball_ids)
+        if thoroughly or n <= 2 * FIRST_ROWS * balls:
+            rows: npt.NDArray[np.int64] = np.arange(n)
+        else:
+            rows = _spread(n) if balls == 1 else _spread_of_each(problem.ball, balls)
+        return cls(problem=problem, cameras=cameras, rays=rays, rows=rows)
 
     @property
     def whole(self) -> bool:

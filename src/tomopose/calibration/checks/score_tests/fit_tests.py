@@ -45,11 +45,8 @@ def score_tests(
     if 2 * n + len(linear.prior_rows) < m + FEWEST:
         return None
     problem = linear.problem.with_covariance(linear.C)
-    white = Whitened(
-        r=np.concatenate([linear.r_white.ravel(), linear.prior_residuals]),
-        A=np.concatenate([linear.J_white.reshape(2 * n, m), linear.prior_rows]),
-        n=n,
-    )
+    A = np.concatenate([linear.J_white().reshape(2 * n, m), linear.prior_rows])
+    white = Whitened(r=linear.residuals, A=A, n=n)
     columns = [c for c in effects_of(problem, b) if c.effect.kind not in without]
     steps = [replace(s, least=max(s.least, n // SHORTEST)) for s in steps_of(problem, b)]
     others = [c for c in columns if c.effect.name not in free.names]
@@ -58,9 +55,9 @@ def score_tests(
     if not len(known):
         return ScannerTests(beside=beside, declared=beside, gain=0.0)
     first = 6 + 3 * len(problem.ball_ids)
-    before = _declared(white, first + known, delta[known])
+    before = _declared(white, A, first + known, delta[known])
     declared = _large(ranked_explanations(problem, before, columns, steps, most=1), least_share)
-    gain = evidence_together(beside, declared, before, white.A[: 2 * n, first + known] * free.sigma[known])
+    gain = evidence_together(beside, declared, before, A[: 2 * n, first + known] * free.sigma[known])
     return ScannerTests(beside=beside, declared=declared, gain=gain, sigma=problem.scanner.sigma)
 
 
@@ -68,9 +65,9 @@ def _large(found: Ranked, least_share: float) -> Ranked:
     return replace(found, chosen=tuple(e for e in found.chosen if e.share > least_share))
 
 
-def _declared(white: Whitened, at: np.ndarray, delta: Array) -> Whitened:
-    """The same rows with the coordinates `at` held at their declared values, and without their priors."""
-    others = np.setdiff1d(np.arange(white.A.shape[1]), at)
-    rows = np.concatenate([np.ones(2 * white.n, dtype=bool), (white.A[2 * white.n :, others] != 0).any(axis=1)])
-    r = white.r + white.A[:, at] @ delta
-    return Whitened(r=r[rows], A=white.A[np.ix_(rows, others)], n=white.n)
+def _declared(white: Whitened, A: Array, at: np.ndarray, delta: Array) -> Whitened:
+    """The same rows, A (k, m), with the coordinates `at` held at their declared values, and without their priors."""
+    others = np.setdiff1d(np.arange(A.shape[1]), at)
+    rows = np.concatenate([np.ones(2 * white.n, dtype=bool), (A[2 * white.n :, others] != 0).any(axis=1)])
+    r = white.r + A[:, at] @ delta
+    return Whitened(r=r[rows], A=A[np.ix_(rows, others)], n=white.n)

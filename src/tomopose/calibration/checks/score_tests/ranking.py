@@ -28,7 +28,7 @@ from tomopose.calibration.checks.score_tests.score import (
     in_pixels,
 )
 from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.model.tall import is_tall, parts, triangle
+from tomopose.calibration.model.tall import is_tall, lengths, parts, triangle
 from tomopose.units import Array
 from tomopose.values import value
 
@@ -292,7 +292,7 @@ def _predicts(white: Whitened, columns: Array) -> bool:
     n, m, c = white.n, white.A.shape[1], columns.shape[1]
     group = np.repeat(np.arange(n) // max(n // 10, 1) % 2, 2)
     priors = white.priors(c)
-    size = np.concatenate([np.linalg.norm(white.A, axis=0), np.linalg.norm(columns, axis=0)])
+    size = np.concatenate([lengths(white.A), np.linalg.norm(columns, axis=0)])
     norm = np.concatenate([np.maximum(size, 1e-300), [1.0]])
     halves = []
     for part in (0, 1):

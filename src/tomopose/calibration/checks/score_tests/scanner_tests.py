@@ -18,7 +18,7 @@ from tomopose.calibration.checks.score_tests.ranking import (
     Single,
     ranked_explanations,
 )
-from tomopose.calibration.checks.score_tests.score import Beside, Whitened, whitened
+from tomopose.calibration.checks.score_tests.score import Whitened, whitened
 from tomopose.calibration.model.ball_projection import ProjectionBlocks
 from tomopose.calibration.model.parameters import FreeParameters, free_parameters
 from tomopose.calibration.model.problem import Problem
@@ -131,7 +131,5 @@ def evidence_together(beside: Ranked, declared: Ranked, before: Whitened, C: Arr
     left = max(beside.chi2, 1e-300)
     fits = min((declared.chi2 - left) / 2, declared.dof / 2 * float(np.log(max(declared.chi2, 1e-300) / left)))
     # half the log determinant of 1 + prior x information: what the freedom of the assumed values costs
-    n = 2 * before.n
-    beside = before.beside if n == len(before.r) else Beside.of(before.A[:n], before.r[:n])
-    C = beside.without(C)
+    C = before.beside_centres().without(C)
     return fits - 0.5 * float(np.linalg.slogdet(np.eye(C.shape[1]) + C.T @ C)[1])

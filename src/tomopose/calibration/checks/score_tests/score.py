@@ -11,7 +11,7 @@ of chi2.  Only inner products enter, so that very long tables are replaced by th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -21,8 +21,8 @@ from numba import njit
 from tomopose.calibration.model.ball_projection import INNER, ProjectionBlocks
 from tomopose.calibration.model.parameters import FreeParameters
 from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.model.tall import is_tall, parts, triangle
-from tomopose.calibration.rigid.fit import Fit, jacobian, linearised
+from tomopose.calibration.model.tall import Table, WhiteRows, is_tall, lengths, parts, times, transposed_times, triangle
+from tomopose.calibration.rigid.fit import Fit, derivatives, linearised
 from tomopose.units import Array
 
 SEEN = 1e-6
@@ -38,7 +38,7 @@ class Whitened:
     first 2 n rows belong to the n centres."""
 
     r: Array
-    A: Array
+    A: Table
     n: int
 
     @cached_property
@@ -46,8 +46,18 @@ class Whitened:
         """What the fit can follow, and what it leaves."""
         return Beside.of(self.A, self.r)
 
+    def beside_centres(self) -> Beside:
+        """The same without the priors."""
+        if len(self.r) == 2 * self.n:
+            return self.beside
+        A = self.A[: 2 * self.n] if isinstance(self.A, np.ndarray) else replace(self.A, priors=self.A.priors[:0])
+        return Beside.of(A, self.r[: 2 * self.n])
+
     def with_columns(self, C: Array) -> Whitened:
         """The fit that can follow the columns C (2 n, c) too."""
+        if isinstance(self.A, WhiteRows):
+            wider = replace(self.A, more=np.concatenate([self.A.more, C], axis=1))
+            return Whitened(r=self.r, A=wider, n=self.n)
         more = np.zeros((len(self.A), C.shape[1]))
         more[: 2 * self.n] = C
         return Whitened(r=self.r, A=np.concatenate([self.A, more], axis=1), n=self.n)
@@ -59,13 +69,13 @@ class Whitened:
 
     def priors(self, c: int) -> Array:
         """The same of the priors, which c columns leave as they are."""
-        A, r = self.A[2 * self.n :], self.r[2 * self.n :]
+        A, r = self.A[2 * self.n : len(self.A)], self.r[2 * self.n :]
         return np.concatenate([A, np.zeros((len(A), c)), r[:, None]], axis=1)
 
 
 def whitened(problem: Problem, free: FreeParameters, fit: Fit, b: ProjectionBlocks) -> Whitened:
     """Residuals and Jacobian of a fit on all rows of `problem`, projected by b, the priors as rows of their own."""
-    linear = linearised(problem, free, fit, b, jacobian(problem, free, b))
+    linear = linearised(problem, free, fit, b, derivatives(problem, free, b))
     return Whitened(r=linear.residuals, A=linear.rows, n=len(problem))
 
 
@@ -74,16 +84,16 @@ class Beside:
     """What a fit can follow: an orthonormal basis Q (k, q), as it is or, of very many rows, as A T with A (k, m) and
     T (m, q);  rest (k,): what the fit leaves."""
 
-    A: Array
+    A: Table
     T: Array | None
     rest: Array
 
     @classmethod
-    def of(cls, A: Array, r: Array) -> Beside:
+    def of(cls, A: Table, r: Array) -> Beside:
         """Of whitened rows A (k, m) and residuals r (k,)."""
-        norm, k = np.linalg.norm(A, axis=0), len(A)
+        norm, k = lengths(A), len(A)
         unit = 1.0 / np.where(norm > 0, norm, 1.0)
-        if not is_tall(k):
+        if isinstance(A, np.ndarray) and not is_tall(k):
             U, s, _ = np.linalg.svd(A * unit, full_matrices=False)
             made = cls(A=np.ascontiguousarray(U[:, s > RANK * s[0]]), T=None, rest=r)
         else:
@@ -94,7 +104,7 @@ class Beside:
 
     @property
     def directions(self) -> int:
-        return int((self.A if self.T is None else self.T).shape[1])
+        return (self.A if self.T is None else self.T).shape[1]
 
     @property
     def chi2(self) -> float:
@@ -110,14 +120,15 @@ class Beside:
 
     def along(self, X: Array) -> Array:
         """The part of X (k,) or (k, c) that the fit can follow."""
-        z = self.A.T @ X
-        return np.asarray(self.A @ (z if self.T is None else self.T @ (self.T.T @ z)))
+        z = transposed_times(self.A, X)
+        return times(self.A, z if self.T is None else self.T @ (self.T.T @ z))
 
     def without(self, C: Array) -> Array:
         """What of the columns C (j, c) of the first j rows, zero in the others, the fit cannot follow: (k, c)."""
-        full = np.zeros((len(self.rest), C.shape[1]))
+        full: Array = np.zeros((len(self.rest), C.shape[1]))
         full[: len(C)] = C
-        return np.asarray(full - self.along(full))
+        full -= self.along(full)
+        return full
 
 
 def gain_of(M: Array, g: Array) -> tuple[float, int]:
