@@ -43,7 +43,7 @@ def posterior_factor(estimate: MapEstimate) -> float:
     linear = linear_fit(estimate)
     quiet = linear_fit(replace(estimate, problem=replace(estimate.problem, scatter=0.0)))
     S = linear.C - quiet.C
-    L = np.array([_minus_2_log(quiet.C + q**2 * S, linear.J, linear.r, linear.prior_rows, linear.prior_residuals)
+    L = np.array([_minus_2_log(quiet.C + q**2 * S, linear.J[:], linear.r, linear.prior_rows, linear.prior_residuals)
                   for q in GRID])  # fmt: skip
     weight = np.gradient(GRID) * scatter_prior(GRID) * np.exp(-0.5 * (L - L.min()))
     return float((weight * GRID**2).sum() / weight.sum())

@@ -160,7 +160,7 @@ def _own_columns(J: Array | ByBall) -> tuple[Array, Any, Array, Any]:
     own = np.concatenate([J.w_HT, J.t_HT, J.own, J.freed], axis=2)
     where = np.broadcast_to(np.r_[:9, 6 + 3 * J.balls : m], (n, own.shape[2])).copy()
     where[:, 6:9] += 3 * J.ball[:, None]
-    squares = np.bincount(where.ravel(), weights=(own**2).sum(axis=1).ravel(), minlength=m)
+    squares: Array = np.bincount(where.ravel(), weights=(own**2).sum(axis=1).ravel(), minlength=m).astype(np.float64)
     return own, J.ball, squares, where[:, None, :]
 
 

@@ -104,7 +104,7 @@ class Beside:
 
     @property
     def directions(self) -> int:
-        return (self.A if self.T is None else self.T).shape[1]
+        return int((self.A if self.T is None else self.T).shape[1])
 
     @property
     def chi2(self) -> float:
