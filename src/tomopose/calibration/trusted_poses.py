@@ -18,7 +18,7 @@ from tomopose.calibration.checks.placement import require_on_panel
 from tomopose.calibration.checks.score_tests.scanner_tests import ScannerTests, rows_to_test, scanner_tests
 from tomopose.calibration.model.assumed import Assumed, scatter_assumed, taken_as_known, without_effect
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS
-from tomopose.calibration.model.covariance import inverse_information, widening
+from tomopose.calibration.model.covariance import widening
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import (
     UNITS,
@@ -176,7 +176,7 @@ def _unseen(solution: Solution, linear: LinearFit, taken: Taken, *, moving_scann
     p, fit = solution.used, solution.fit
     return unseen_of(
         solution.at,
-        inverse_information(fit.N),
+        fit.inverse,
         linear.J,
         linear.C,
         T_HT=fit.T_HT,

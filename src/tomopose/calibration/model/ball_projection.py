@@ -12,10 +12,10 @@ All derivatives are analytic; the tangent of R_HT is the rotation vector w with 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numba import njit
@@ -26,6 +26,7 @@ from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
 
+Compiled = TypeVar("Compiled", bound=Callable[..., object])
 Three: TypeAlias = tuple[float, float, float]
 
 SCANNER_COLUMNS = (
@@ -48,10 +49,6 @@ SCANNER_COLUMNS = (
 `translation_scale` (nominal 1) multiplies the translations t_MH that the manipulator reports.
 """
 
-INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-"""Of a function that only compiled code calls: a fifth of the time to compile it goes into being called by Python."""
-
-
 _NUMBERS = attrgetter(*SCANNER_COLUMNS[:-1])
 
 
@@ -60,7 +57,21 @@ def scanner_vector(scanner: Scanner, translation_scale: float = 1.0) -> Array:
     return np.array([*_NUMBERS(scanner), translation_scale])
 
 
-@njit(cache=True, **INNER)
+_UNCALLED: dict[str, Any] = {
+    "cache": True,
+    "error_model": "numpy",
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+}
+
+
+def inner(function: Compiled) -> Compiled:
+    """Compile what only compiled code calls: without the wrappers by which Python and C would call it."""
+    compiled: Compiled = njit(**_UNCALLED)(function)
+    return compiled
+
+
+@inner
 def view_of(v: Array, r: int) -> None:
     """Row r of v (runs, 29): what all poses of a run have in common, from its scanner vector, the first 13 numbers.
 
@@ -87,20 +98,20 @@ POSE = 14
 """Numbers of a pose: R_MH by rows, t_MH, cos and sin of the table's angle."""
 
 CENTRE, MOVES, EVERYTHING = range(3)
-"""What `project_pose` writes: x, x_H and y_T; the derivatives by the place of the ball too; by the scanner too."""
+"""What `project_pose` writes: x, x_H and y_T; the derivatives by ball and mount too; by the scanner too."""
 
-X, X_H, Y_T, G_T, G_H, J_S, PROJECTED = 0, 2, 5, 8, 14, 20, 46
-"""Where `project_pose` writes x (2) px; x_H (3), y_T = R_HT x_H (3) mm; dx/dx_T and dx/dx_H (2, 3); derivatives (2, 13)
-by SCANNER_COLUMNS, and how many numbers these are."""
+X, X_H, Y_T, G_T, G_H, J_W, J_S, PROJECTED = 0, 2, 5, 8, 14, 20, 26, 52
+"""Where `project_pose` writes x (2) px; x_H (3), y_T = R_HT x_H (3) mm; dx/dx_T, dx/dx_H and the derivatives by a turn
+of the mount, y_T x dx/dx_T (2, 3); derivatives (2, 13) by SCANNER_COLUMNS, and how many numbers these are."""
 
 
 BALLS = 12
 """Where the balls begin in a point: R_HT by rows, t_HT, then the balls (3 each)."""
 
 
-@njit(cache=True, error_model="numpy", **INNER)
+@inner
 def project_pose(v: Array, at: Array, poses: Array, index: tuple[int, int, int], wanted: int, out: Array) -> bool:
-    """One pose, written into `out` (46,); False where the ball is not in front of the source.
+    """One pose, written into `out` (52,); False where the ball is not in front of the source.
 
     v (runs, 29): as of `view_of`;  at: see BALLS;  poses (n, 14);  index: run, pose and ball;  wanted: see CENTRE.
     Whole arrays and an index, since every view of an array costs two counts of references.
@@ -145,6 +156,8 @@ def project_pose(v: Array, at: Array, poses: Array, index: tuple[int, int, int],
         g2 = w[1] * M2[2] - w[2] * M0[2] - w[0] * M1[2]
         G = G_T + 3 * e
         out[G], out[G + 1], out[G + 2] = g0, g1, g2
+        W, y0, y1 = J_W + 3 * e, out[Y_T], out[Y_T + 1]
+        out[W], out[W + 1], out[W + 2] = y1 * g2 - out[Y_T + 2] * g1, out[Y_T + 2] * g0 - y0 * g2, y0 * g1 - y1 * g0
         for i in range(3):
             out[G_H + 3 * e + i] = g0 * at[i] + g1 * at[3 + i] + g2 * at[6 + i]
         if wanted == EVERYTHING:
@@ -160,7 +173,7 @@ def project_pose(v: Array, at: Array, poses: Array, index: tuple[int, int, int],
     return True
 
 
-@njit(cache=True, **INNER)
+@inner
 def _by_panel_angles(v: Array, r: int, x_S: Three, w: Three, f: float, q: float, e: int, out: Array) -> None:
     """Columns eta, theta, phi, of row e: dR = [n]_x R with n = R e_z, e_x, R_x(theta) e_y; dy = R^T (x_S x n).
 
@@ -177,7 +190,7 @@ def _by_panel_angles(v: Array, r: int, x_S: Three, w: Three, f: float, q: float,
         out[J_S + 13 * e + 6 + k] = w[0] * c0 + w[1] * c1 + w[2] * c2 + f * (r_2 * q - r_e)
 
 
-@njit(cache=True, **INNER)
+@inner
 def _by_table_axis(v: Array, r: int, z: Three, m: Three, w: Three, g: Three, J: int, out: Array) -> None:
     """Columns axis_y, axis_tilt_x, axis_tilt_y of the row that begins at J: x_W = M z + o with o = (0, axis_y, 0),
     z = x_T - o, m = M z.
@@ -194,7 +207,7 @@ def _by_table_axis(v: Array, r: int, z: Three, m: Three, w: Three, g: Three, J: 
 
 @njit(cache=True, error_model="numpy")
 def _project_all(s: Array, run: Any, at: Array, poses: Array, wanted: int, found: Array, x: Array) -> None:
-    """x (n, 2): the centres, left as they are where a ball is behind the source;  found (n, 46): see X, of which one
+    """x (n, 2): the centres, left as they are where a ball is behind the source;  found (n, 52): see X, of which one
     row is enough where only the CENTRE is wanted.
 
     s (runs, 13), run (n,), poses (n, 14);  at: see BALLS, one ball a pose.
@@ -299,9 +312,9 @@ def projection_blocks(
     index = np.zeros(n, dtype=np.int64) if run is None else np.array(run, dtype=np.int64)
     x, b = np.full((n, 2), np.nan), np.zeros((n, PROJECTED))
     _project_all(s, index, np.concatenate([T_HT.R.ravel(), T_HT.t, t_k.ravel()]), poses, EVERYTHING, b, x)
-    by_T, by_H = (b[:, first : first + 6].reshape(n, 2, 3) for first in (G_T, G_H))
+    by_T, by_H, by_w = (b[:, first : first + 6].reshape(n, 2, 3) for first in (G_T, G_H, J_W))
     return ProjectionBlocks(
-        x_D=x, J_w_HT=np.cross(b[:, None, Y_T : Y_T + 3], by_T), J_t_HT=by_T, J_t=by_H @ R_MH,
+        x_D=x, J_w_HT=by_w, J_t_HT=by_T, J_t=by_H @ R_MH,
         J_scanner=b[:, J_S:].reshape(n, 2, 13), x_H=b[:, X_H : X_H + 3].copy(), t=t_k, R_MH=R_MH, G_H=by_H,
     )  # fmt: skip
 

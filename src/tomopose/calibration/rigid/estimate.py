@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tomopose.calibration.model.ball_projection import ProjectionBlocks
-from tomopose.calibration.model.covariance import inverse_information, significant, widening
+from tomopose.calibration.model.covariance import significant, widening
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import UNITS, FreeParameters, free_parameters
 from tomopose.calibration.model.problem import POSITION_UNITS, Problem
@@ -219,7 +219,7 @@ def solve(
         kept=None if is_tall(2 * len(used)) else b,
         chi2=chi2,
         dof=dof,
-        covariance=inverse_information(result.fit.N) * widening(chi2, dof),
+        covariance=result.fit.inverse * widening(chi2, dof),
     )
 
 

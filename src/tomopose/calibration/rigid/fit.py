@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from tomopose.calibration.model.ball_projection import (
     projected_centres,
     projection_blocks,
 )
+from tomopose.calibration.model.covariance import inverse_information
 from tomopose.calibration.model.linear_fit import LinearFit
 from tomopose.calibration.model.parameters import FreeParameters, adjusted_scanners, translation_scale
 from tomopose.calibration.model.problem import Problem
@@ -49,6 +51,11 @@ class Fit:
     @property
     def converged(self) -> bool:
         return self.status is Status.CONVERGED
+
+    @cached_property
+    def inverse(self) -> Array:
+        """(m, m): N^-1, the covariance by what was stated."""
+        return inverse_information(self.N)
 
     @property
     def T_HT(self) -> RigidTransform:

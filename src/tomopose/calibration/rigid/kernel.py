@@ -18,13 +18,13 @@ from tomopose.calibration.model.ball_projection import (
     EVERYTHING,
     G_H,
     G_T,
-    INNER,
     J_S,
+    J_W,
     MOVES,
     PROJECTED,
     VIEW,
-    Y_T,
     X,
+    inner,
     project_pose,
     view_of,
 )
@@ -65,7 +65,7 @@ class Freed(NamedTuple):
     information: Array
 
 
-@njit(cache=True, **INNER)
+@inner
 def _turned(w: Array, R: Array, out: Array) -> None:
     """The first nine numbers of `out`: exp([w]_x) R by Rodrigues' formula, w and R being the first of theirs."""
     a2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -82,7 +82,7 @@ def _turned(w: Array, R: Array, out: Array) -> None:
         out[6 + j] = r2 + s * c2 + c * (w[0] * c1 - w[1] * c0)
 
 
-@njit(cache=True, error_model="numpy", **INNER)
+@inner
 def _step(N: Array, lam: float, g: Array, L: Array, step: Array) -> tuple[float, float]:
     """step = (N + lam diag N)^-1 g by Cholesky.
 
@@ -132,6 +132,23 @@ def scanner_vectors(freed: Freed, delta: Array, s: Array) -> None:
                 s[r, freed.cols[j]] += freed.factor[j] * delta[delta.shape[0] - f + j]
 
 
+TOGETHER = 64
+"""Rows whose products are summed together."""
+
+
+@inner
+def add_products(A: Array, B: Array, n: int, N: Array) -> None:
+    """Add those of the first n rows to the lower triangle of N (m, m): A^T A + B^T B, A and B (k, m).
+
+    The rows are written before their products are summed: then the sums over j are vector instructions.
+    """
+    for k in range(n):
+        for i in range(N.shape[0]):
+            a, b = A[k, i], B[k, i]
+            for j in range(i + 1):
+                N[i, j] += a * A[k, j] + b * B[k, j]
+
+
 @njit(cache=True, error_model="numpy")
 def normal_equations(rows: Rows, freed: Freed, at: Array, N: Array, g: Array) -> float:
     """chi2 at a point, and N = J^T J and g = J^T r there (r = observed - calculated, whitened).
@@ -144,14 +161,14 @@ def normal_equations(rows: Rows, freed: Freed, at: Array, N: Array, g: Array) ->
     n, m, n_f = x_meas.shape[0], g.shape[0], cols.shape[0]
     free_from = m - n_f
     w = 9 + n_f
-    a, b, where = np.empty(w), np.empty(w), np.empty(w, dtype=np.int64)
+    A, B, where = np.empty((TOGETHER, w)), np.empty((TOGETHER, w)), np.empty(w, dtype=np.int64)
     out = np.zeros(PROJECTED)
     wanted = EVERYTHING if n_f > 0 else MOVES
     views = np.empty((s_0.shape[0], VIEW))
     scanner_vectors(freed, at, views)
     for r in range(views.shape[0]):
         view_of(views, r)
-    chi2 = 0.0
+    chi2, row = 0.0, 0
     N[:] = 0.0
     g[:] = 0.0
     for i in range(6):
@@ -164,35 +181,34 @@ def normal_equations(rows: Rows, freed: Freed, at: Array, N: Array, g: Array) ->
         if not project_pose(views, at, poses, (run[k], k, ball[k]), wanted, out):
             return np.inf
         du, dv = x_meas[k, 0] - out[X], x_meas[k, 1] - out[X + 1]
-        r0 = W[k, 0, 0] * du + W[k, 0, 1] * dv
-        r1 = W[k, 1, 0] * du + W[k, 1, 1] * dv
-        chi2 += weight[k] * (r0 * r0 + r1 * r1)
+        root = math.sqrt(weight[k])
+        w00, w01, w10, w11 = root * W[k, 0, 0], root * W[k, 0, 1], root * W[k, 1, 0], root * W[k, 1, 1]
+        r0, r1 = w00 * du + w01 * dv, w10 * du + w11 * dv
+        chi2 += r0 * r0 + r1 * r1
         for e in range(2):
-            c = a if e == 0 else b
-            G, H, J = G_T + 3 * e, G_H + 3 * e, J_S + 13 * e
-            c[0] = out[Y_T + 1] * out[G + 2] - out[Y_T + 2] * out[G + 1]
-            c[1] = out[Y_T + 2] * out[G] - out[Y_T] * out[G + 2]
-            c[2] = out[Y_T] * out[G + 1] - out[Y_T + 1] * out[G]
+            C = A if e == 0 else B
+            H, J = G_H + 3 * e, J_S + 13 * e
             for i in range(3):
-                c[3 + i] = out[G + i]
-                c[6 + i] = out[H] * poses[k, i] + out[H + 1] * poses[k, 3 + i] + out[H + 2] * poses[k, 6 + i]
+                C[row, i], C[row, 3 + i] = out[J_W + 3 * e + i], out[G_T + 3 * e + i]
+                C[row, 6 + i] = out[H] * poses[k, i] + out[H + 1] * poses[k, 3 + i] + out[H + 2] * poses[k, 6 + i]
             for j in range(n_f):
-                c[9 + j] = out[J + cols[j]] * factor[j] if col_run[j] < 0 or col_run[j] == run[k] else 0.0
+                C[row, 9 + j] = out[J + cols[j]] * factor[j] if col_run[j] < 0 or col_run[j] == run[k] else 0.0
         for i in range(3):
             where[6 + i] = 6 + 3 * ball[k] + i
         for i in range(w):
-            u, v = a[i], b[i]
-            a[i] = W[k, 0, 0] * u + W[k, 0, 1] * v
-            b[i] = W[k, 1, 0] * u + W[k, 1, 1] * v
-        for i in range(w):
-            p, q, wi = weight[k] * a[i], weight[k] * b[i], where[i]
-            g[wi] += p * r0 + q * r1
-            if m == w:  # every unknown is at its own place: the same sums, written without a detour
+            u, v = A[row, i], B[row, i]
+            A[row, i], B[row, i] = w00 * u + w01 * v, w10 * u + w11 * v
+            g[where[i]] += A[row, i] * r0 + B[row, i] * r1
+        if m == w:  # every unknown is at its own place
+            row += 1
+            if row == TOGETHER:
+                add_products(A, B, row, N)
+                row = 0
+        else:
+            for i in range(w):
                 for j in range(i + 1):
-                    N[i, j] += p * a[j] + q * b[j]
-            else:
-                for j in range(i + 1):
-                    N[wi, where[j]] += p * a[j] + q * b[j]
+                    N[where[i], where[j]] += A[0, i] * A[0, j] + B[0, i] * B[0, j]
+    add_products(A, B, row, N)
     for j in range(n_f):
         delta, i = at[at.shape[0] - n_f + j], free_from + j
         chi2 += information[j] * delta * delta
@@ -269,7 +285,7 @@ def levenberg_marquardt(
     return chi2, OUT_OF_STEPS, at, N
 
 
-@njit(cache=True, **INNER)
+@inner
 def _log_rotation(D: Array, out: Array) -> None:
     """Rotation vector of D, angles below pi."""
     c = min(max((D[0, 0] + D[1, 1] + D[2, 2] - 1.0) / 2.0, -1.0), 1.0)
@@ -279,7 +295,7 @@ def _log_rotation(D: Array, out: Array) -> None:
     out[0], out[1], out[2] = f * v0, f * v1, f * v2
 
 
-@njit(cache=True, **INNER)
+@inner
 def _solve_one(
     rows: Rows, freed: Freed, centre: Array, start: Array, iterations: int, theta: Array
 ) -> tuple[float, int]:

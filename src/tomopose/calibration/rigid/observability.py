@@ -80,7 +80,8 @@ def useless(names: tuple[str, ...]) -> Array:
 def singular_values(J: Array) -> tuple[Array, Array]:
     """Singular values of the column-normalised Jacobian (k, m), largest first, and right vectors (m, m) by rows."""
     norm = np.linalg.norm(J, axis=0)
-    _, s, Vt = np.linalg.svd(J / np.where(norm > 0, norm, 1.0), full_matrices=False)
+    # of many rows the triangle has the same, without the left vectors
+    _, s, Vt = np.linalg.svd(np.linalg.qr(J / np.where(norm > 0, norm, 1.0), mode="r"), full_matrices=False)
     return s, Vt / np.where(norm > 0, norm, 1.0)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tomopose.calibration.model.covariance import inverse_information, median
+from tomopose.calibration.model.covariance import median
 from tomopose.calibration.model.parameters import FreeParameters
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.model.tall import ByBall, parts
@@ -70,11 +70,10 @@ def studentised(problem: Problem, fit: Fit, keep: npt.NDArray[np.bool_], x_calc:
     x_calc (n, 2) px and J (n, 2, m): calculated centres and their derivatives at the fit.
     """
     r = problem.x_D - x_calc
-    covariance = inverse_information(fit.N)
     spread: Array = np.empty((len(r), 2, 2))
     for p in parts(len(r)):
         some = J[p]
-        spread[p] = some @ covariance @ np.swapaxes(some, 1, 2)
+        spread[p] = some @ fit.inverse @ np.swapaxes(some, 1, 2)
     V = problem.covariance + np.where(keep[:, None, None], -spread, spread)
     V = problem.W @ V @ np.swapaxes(problem.W, 1, 2)
     y_0, y_1 = (problem.W @ r[:, :, None])[..., 0].T

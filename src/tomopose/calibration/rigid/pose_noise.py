@@ -26,6 +26,7 @@ from numba import njit
 
 from tomopose.calibration.model.ball_projection import ProjectionBlocks
 from tomopose.calibration.model.tall import ByBall
+from tomopose.calibration.rigid.kernel import TOGETHER, add_products
 from tomopose.geometry.rotations import skew
 from tomopose.manipulator.real_poses import Repeatability
 from tomopose.units import Array
@@ -98,7 +99,8 @@ def _minus_2_log_likelihood(
     N, g = np.zeros((m, m)), np.zeros(m)
     total = 0.0
     a, b = s_t * s_t, s_w * s_w
-    p, q = np.empty(w), np.empty(w)
+    P, Q = np.empty((TOGETHER, w)), np.empty((TOGETHER, w))
+    row = 0
     for k in range(n):
         v00 = C[k, 0, 0] + a * A[k, 0, 0] + b * B[k, 0, 0]
         v01 = C[k, 0, 1] + a * A[k, 0, 1] + b * B[k, 0, 1]
@@ -114,17 +116,19 @@ def _minus_2_log_likelihood(
             for i in range(3):
                 where[6 + i] = 6 + 3 * ball[k] + i
         for i in range(w):
-            p[i] = J[k, 0, i] * i00
-            q[i] = (J[k, 1, i] - l10 * p[i]) * i11
-            g[where[i]] += p[i] * x + q[i] * y
-        for i in range(w):
-            p_i, q_i, wi = p[i], q[i], where[i]
-            if w == m:  # every unknown is at its own place: the same sums, written without a detour
+            P[row, i] = J[k, 0, i] * i00
+            Q[row, i] = (J[k, 1, i] - l10 * P[row, i]) * i11
+            g[where[i]] += P[row, i] * x + Q[row, i] * y
+        if w == m:  # every unknown is at its own place
+            row += 1
+            if row == TOGETHER:
+                add_products(P, Q, row, N)
+                row = 0
+        else:
+            for i in range(w):
                 for j in range(i + 1):
-                    N[i, j] += p_i * p[j] + q_i * q[j]
-            else:
-                for j in range(i + 1):
-                    N[wi, where[j]] += p_i * p[j] + q_i * q[j]
+                    N[where[i], where[j]] += P[0, i] * P[0, j] + Q[0, i] * Q[0, j]
+    add_products(P, Q, row, N)
     for i in range(m):
         N[i, i] += information[i]
         g[i] -= pull[i]

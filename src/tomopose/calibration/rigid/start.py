@@ -106,9 +106,12 @@ def _positions(s: _Stack, R_HT: Array) -> tuple[Array, Array]:
     return x[:, :3], x[:, 3:].reshape(a, s.balls, 3)
 
 
-def positions_for(problem: Problem, R_HT: Array, rays: Rays) -> tuple[Array, Array]:
-    """t_HT (3,) and t (balls, 3) that fit best under a given R_HT: linear."""
-    t_HT, t = _positions(_Stack.of([problem], [rays], [np.arange(len(problem))]), R_HT[None])
+def positions_for(
+    problem: Problem, R_HT: Array, rays: Rays, rows: npt.NDArray[np.int64] | None = None
+) -> tuple[Array, Array]:
+    """t_HT (3,) and t (balls, 3) that fit some rows (k,), or all, best under a given R_HT: linear."""
+    some = np.arange(len(problem)) if rows is None else rows
+    t_HT, t = _positions(_Stack.of([problem], [rays], [some]), R_HT[None])
     return t_HT[0], t[0]
 
 
@@ -160,12 +163,14 @@ def closed_form(problem: Problem, rays: Rays) -> tuple[Array, Array, Array]:
     return closed_forms([problem], [rays], [np.arange(len(problem))])[0]
 
 
-def turned_about_beam(problem: Problem, R_HT: Array, rays: Rays) -> tuple[Array, Array, Array]:
-    """The start half a turn about the beam from R_HT: what the closed form of nearly flat data may land on behind the
-    source, since only the weak change of magnification distinguishes the two."""
+def turned_about_beam(
+    problem: Problem, R_HT: Array, rays: Rays, rows: npt.NDArray[np.int64]
+) -> tuple[Array, Array, Array]:
+    """The start half a turn about the beam from R_HT, by some rows (k,): what the closed form of nearly flat data may
+    land on behind the source, since only the weak change of magnification distinguishes the two."""
     beam = rays.source / np.linalg.norm(rays.source)
     turned = (2 * np.outer(beam, beam) - np.eye(3)) @ R_HT
-    return (turned, *positions_for(problem, turned, rays))
+    return (turned, *positions_for(problem, turned, rays, rows))
 
 
 @functools.cache

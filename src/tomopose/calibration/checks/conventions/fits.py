@@ -132,13 +132,6 @@ class Reading:
         weight[self.rows] = 1.0
         return weight
 
-    def part(self) -> tuple[Problem, Rays]:
-        """Those rows alone."""
-        if self.whole:
-            return self.problem, self.rays
-        few = Rays(n=self.rays.n[self.rows], d=self.rays.d[self.rows], source=self.rays.source)
-        return self.problem.select(self.rows), few
-
 
 def linear_starts(readings: Sequence[Reading]) -> list[tuple[Array, Array, Array]]:
     """R_HT, t_HT, t of each in closed form, of those with as many rows and balls at once."""
@@ -205,16 +198,17 @@ def fitted(
 
 def _from_elsewhere(one: Reading, start: tuple[Array, Array, Array], held: FreeParameters, starts: int) -> Fit:
     """The optimum from half a turn about the beam, or from the best of some rotations."""
-    part, rays = one.part()
-    fit = minimise(part, held, turned_about_beam(part, start[0], rays), iterations=ITERATIONS)
+    problem, weight = one.problem, one.weight
+    turned = turned_about_beam(problem, start[0], one.rays, one.rows)
+    fit = minimise(problem, held, turned, weight=weight, iterations=ITERATIONS)
     if np.isfinite(fit.chi2):
         return fit
     # mirrored data have no closed form in front of the source; the residual they leave is still worth knowing
     others = (
-        minimise(part, held, other, iterations=ITERATIONS)
-        for other in itertools.islice(other_starts(part, rays), starts)
+        minimise(problem, held, other, weight=weight, iterations=ITERATIONS)
+        for other in itertools.islice(other_starts(problem, one.rays), starts)
     )
-    return minimise(part, held, min((fit, *others), key=lambda one: one.chi2))
+    return minimise(problem, held, min((fit, *others), key=lambda one: one.chi2), weight=weight)
 
 
 def optimum_under(problem: Problem, free: FreeParameters) -> Fit:

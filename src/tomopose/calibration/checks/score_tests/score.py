@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from tomopose.calibration.model.ball_projection import INNER, ProjectionBlocks
+from tomopose.calibration.model.ball_projection import ProjectionBlocks, inner
 from tomopose.calibration.model.parameters import FreeParameters
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.model.tall import Table, WhiteRows, is_tall, lengths, parts, times, transposed_times, triangle
@@ -94,8 +94,10 @@ class Beside:
         norm, k = lengths(A), len(A)
         unit = 1.0 / np.where(norm > 0, norm, 1.0)
         if isinstance(A, np.ndarray) and not is_tall(k):
-            U, s, _ = np.linalg.svd(A * unit, full_matrices=False)
-            made = cls(A=np.ascontiguousarray(U[:, s > RANK * s[0]]), T=None, rest=r)
+            Q, R = np.linalg.qr(A * unit)
+            U, s, _ = np.linalg.svd(R)
+            seen = s > RANK * s[0]
+            made = cls(A=Q if seen.all() else Q @ U[:, seen], T=None, rest=r)
         else:
             _, s, Vt = np.linalg.svd(triangle(A[p] * unit for p in parts(k)), full_matrices=False)
             seen = s > RANK * s[0]
@@ -147,7 +149,7 @@ def in_pixels(W: Array, v: Array) -> Array:
     return np.column_stack([du, (v[:, 1] - W[:, 1, 0] * du) / W[:, 1, 1]])
 
 
-@njit(cache=True, error_model="numpy", **INNER)
+@inner
 def _one_place(M: Array, z: Array, S: Array, x: Array) -> float:
     """z^T M^-1 z by Cholesky; NaN where an eigenvalue of M (c, c), its diagonal at most 1, may be as small as SEEN: the
     trace of the inverse bounds it.  S (c, c) and x (c,) are work space."""
