@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from tomopose.engines import make_engine
+from tomopose.engines.cpu import axes_of
+from tomopose.engines.geometry import index_geometry
+from tomopose.engines.layout import Rays
 from tomopose.geometry.projection import ProjectionMatrices, compose
 from tomopose.geometry.rotations import R_x, R_y, R_z
 from tomopose.volume import VoxelGrid
@@ -31,6 +34,20 @@ def views(n_u: int = 37, n_v: int = 31, pitch: float = 1.0) -> ProjectionMatrice
 
 def scale_of(a: np.ndarray) -> float:
     return float(np.abs(a).max())
+
+
+def test_a_view_walks_along_the_axes_that_its_rays_are_steepest_along_and_no_others():
+    matrices, geometry = views(), index_geometry(views(), GRID)
+    several = 0
+    for j in range(len(matrices)):
+        rays = Rays(shape=GRID.n_xyz, spacing=GRID.spacing, source=geometry.source[j], M_inv=geometry.M_inv[j])
+        u, v = np.meshgrid(np.arange(matrices.n_u), np.arange(matrices.n_v))
+        d = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1) @ geometry.M_inv[j].T
+        used = {int(a) for a in np.unique(np.abs(d).argmax(axis=1))}
+        found = axes_of(rays, matrices.n_u, matrices.n_v)
+        assert used == set(found) if len(used) == 1 else used <= set(found)
+        several += len(used) > 1
+    assert 0 < several < len(matrices)
 
 
 @pytest.mark.parametrize("kernels", ["vector", "plain"])

@@ -11,7 +11,7 @@ import numpy as np
 
 from tomopose.engines import vector
 from tomopose.engines.back_projection import back_columns
-from tomopose.engines.forward_projection import forward_columns, ray_lengths, scatter_planes
+from tomopose.engines.forward_projection import forward_columns, ray_lengths, scatter_planes, steepest_axis
 from tomopose.engines.geometry import index_geometry
 from tomopose.engines.layout import BORDER, MARGIN, TILE, Lookup, Rays, Support
 from tomopose.engines.protocol import Availability, Limits, Weight, require_images, require_support, require_views
@@ -133,12 +133,13 @@ class CpuEngine:
         flat = state.reshape(-1)
         for image, j in zip(images, views, strict=True):
             lines, rays = np.ascontiguousarray(image.T), self._rays(j)
-            for axis, n in enumerate(self.grid.n_xyz):
+            for axis in axes_of(rays, *lines.shape):
+                n = self.grid.n_xyz[axis]
 
                 def part(start: int, stop: int, axis: int = axis, lines: np.ndarray = lines, rays: Rays = rays) -> None:
                     scatter_planes(flat, rays, lines, axis, start, stop)
 
-                self._share(part, n, max(TILE, n // (2 * self.threads)))
+                self._share(part, n, max(2 * TILE, -(-n // self.threads)))
         for axis in range(3):
             edge = np.moveaxis(state, axis, 0)
             edge[0], edge[-2:] = 0.0, 0.0
@@ -171,6 +172,20 @@ class CpuEngine:
 
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "_pool": None}
+
+
+def axes_of(rays: Rays, n_u: int, n_v: int) -> tuple[int, ...]:
+    """The axes along which rays of a view of n_u x n_v pixels may be steepest.
+
+    Directions steepest along one axis, with one sign, are a convex cone: where those of the four corner pixels are, all
+    are.
+    """
+    corners = np.array([[u, v, 1] for u in (0, n_u - 1) for v in (0, n_v - 1)])
+    d = corners @ rays.M_inv.T
+    found = {steepest_axis(*each) for each in d}
+    axis = found.pop()
+    signs = np.sign(d[:, axis])
+    return (axis,) if not found and signs[0] != 0 and np.all(signs == signs[0]) else (0, 1, 2)
 
 
 def inside_of(support: np.ndarray | None) -> np.ndarray:
