@@ -11,7 +11,7 @@ import pytest
 
 import tomopose as tp
 from tomopose.engines.cpu import CpuEngine
-from tomopose.refinement.estimate import levels_of
+from tomopose.refinement.estimate import judged_at, levels_of
 from tomopose.refinement.joint_fit.linear import Linear
 from tomopose.refinement.joint_fit.measured import Measured
 from tomopose.refinement.joint_fit.motions import pixel_jacobian
@@ -77,8 +77,7 @@ def test_preconditioned_turns_come_nearer_to_the_solution_than_as_many_plain_one
 
     def left(turns, H):
         linear = Linear.of(engine, free, J, w, 1e6 * np.eye(n), 1.0, H)
-        dx, _ = linear.solve(lines, np.zeros(n), np.zeros_like(truth), turns=turns, tolerance=0)
-        return dx
+        return linear.solve(lines, np.zeros(n), np.zeros_like(truth), turns=turns, tolerance=0)[0]
 
     best = left(200, None)
     H = passed_frequencies(m, GRID)
@@ -93,6 +92,16 @@ def test_levels_that_do_not_fit_the_memory_or_the_work_are_left_out():
     large = replace(data, matrices=replace(data.matrices, n_u=512, n_v=500))
     assert levels_of(large, tp.RefineSettings(memory_gib=8)) == (4, 2, 1)
     assert levels_of(large, tp.RefineSettings(memory_gib=0.5)) == (8, 4, 2)
+
+
+def test_what_judges_is_seen_at_twice_the_finest_binning_where_pixels_remain():
+    data = data_of(np.zeros((12, 47 * 43), dtype=np.float32))
+    large = replace(data, matrices=replace(data.matrices, n_u=512, n_v=500))
+    assert judged_at(large, (8, 4), 4) == 8
+    assert judged_at(large, (8, 4), 8) == 8  # a fit that ended at its first level
+    assert judged_at(large, (4, 2, 1), 1) == 2
+    assert judged_at(large, (16, 8), 8) == 8
+    assert judged_at(data, (1,), 1) == 1
 
 
 def test_evidence_finds_the_size_of_the_scatter_and_leaves_none_where_there_is_none():

@@ -37,6 +37,7 @@ def test_scattered_views_come_three_times_nearer_and_state_how_near():
     assert 0.5 < result.halves_px / result.stated_px < 2
     assert result.matrices.points_sigma.shape == (24, 9)
     assert result.matrices.pose_id == matrices.pose_id
+    assert result.edge_blur_after_mm < 0.9 * result.edge_blur_before_mm
     assert any("calibration alone" in sentence for sentence in result.unobservable)
 
 

@@ -115,7 +115,8 @@ def refinement() -> str:
     return refinement_report(
         RefinedViews(
             columns=columns, verdict="applied", reasons=("held-out pixels fit better",), unobservable=("a shift",),
-            gain=12.0, halves_px=0.02, stated_px=0.03, before=volume(), after=volume(), provenance=None,
+            gain=12.0, halves_px=0.02, stated_px=0.03, edge_blur_mm=(0.5, 0.3), before=volume(), after=volume(),
+            provenance=None,
         )
     )  # fmt: skip
 

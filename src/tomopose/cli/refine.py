@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -39,6 +40,12 @@ class Options(ScanAndGrid, CorrectedImages, KeptOptions, WritingOptions):
         Path | None,
         typer.Option("--poses", help="The scan's poses.csv: with --calibration its whole covariance is the prior."),
     ] = None
+    balls: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--balls", help="observations.csv of a ball on the object, pose ids as the matrices'; once for each ball."
+        ),
+    ] = None
     memory: Annotated[
         float | None, typer.Option("--memory-gib", help="Keep within this much memory: finer levels are left out.")
     ] = None
@@ -69,6 +76,7 @@ def refine(options: Options) -> int:
     P = tp.read_matrices(o.matrices)
     calibration = None if o.calibration is None else tp.read_calibration(o.calibration)
     poses = None if o.poses is None else tp.read_poses(o.poses)
+    balls = [tp.read_observations(path) for path in o.balls or ()]
     known: Any = None if o.scanner is None else tp.read_scanner(o.scanner)
     stack = open_for(
         say, image_source(o.images), known, None, dark=o.dark, flat=o.flat, dataset=o.dataset, rows=o.rows, raw=o.raw
@@ -82,14 +90,14 @@ def refine(options: Options) -> int:
             grid,
             calibration,
             poses=poses,
+            balls=balls,
             correction=correction,
             settings=settings,
             checkpoint=o.checkpoint,
             progress=progress,
         )
-    inputs = [
-        path for path in (o.matrices, o.calibration, o.poses, o.scanner, o.bad_pixels, o.scene) if path is not None
-    ]
+    given = (o.matrices, o.calibration, o.poses, *(o.balls or ()), o.scanner, o.bad_pixels, o.scene)
+    inputs = [path for path in given if path is not None]
     asked = arguments(
         voxel_mm=o.voxel, size=o.size, centre_mm=o.centre, images_are=o.images_are, verdict=result.verdict,
         **(dict(result.provenance.arguments) if result.provenance else {}),
@@ -117,6 +125,7 @@ def write(o: Options, result: Refinement, made: Provenance) -> None:
         gain=result.held_out_gain,
         halves_px=result.halves_px,
         stated_px=result.stated_px,
+        edge_blur_mm=(result.edge_blur_before_mm, result.edge_blur_after_mm),
         before=result.volume_before,
         after=result.volume,
         provenance=made,
@@ -143,9 +152,13 @@ def said(o: Options, result: Refinement) -> None:
             "converged": result.converged,
             "median_residual_before": float(np.median(result.residual_before)),
             "median_residual_after": float(np.median(result.residual_after)),
-            "halves_px": result.halves_px if np.isfinite(result.halves_px) else None,
+            "halves_px": result.halves_px,
             "stated_px": result.stated_px,
+            "edge_blur_before_mm": result.edge_blur_before_mm,
+            "edge_blur_after_mm": result.edge_blur_after_mm,
             "points_sigma_px": None if sigma is None else float(np.sqrt(np.mean(sigma**2))),
+            "balls_mm": result.balls,
+            "balls_residual_over_sigma": result.balls_misfit,
             "jumps": [result.pose_id[j] for j in result.outliers],
         },
         [
@@ -155,7 +168,26 @@ def said(o: Options, result: Refinement) -> None:
             f"{np.median(result.residual_after):.3g} after",
             f"  uncertainty of a view: {result.stated_px:.3g} px a coordinate stated, {result.halves_px:.3g} px by two "
             "halves of the views refined apart",
+            *edges_in_words(result),
+            *balls_in_words(result),
             *(f"  view {result.pose_id[j]} stands out from the others" for j in result.outliers),
             *(f"  note: {sentence}" for sentence in result.unobservable),
         ],
     )
+
+
+def edges_in_words(result: Refinement) -> list[str]:
+    """How sharp the edges are under both geometries; nothing where none can be measured."""
+    before, after = result.edge_blur_before_mm, result.edge_blur_after_mm
+    if not (math.isfinite(before) and math.isfinite(after)):
+        return []
+    words = f"{before:.3g} mm with the input's geometry, {after:.3g} mm with the refined one"
+    return [f"  blur of the volume's edges, standard deviation: {words}"]
+
+
+def balls_in_words(result: Refinement) -> list[str]:
+    """Where the balls on the object sit; nothing without them."""
+    if result.balls is None:
+        return []
+    places = "; ".join(", ".join(f"{c:.4f}" for c in x) for x in result.balls)
+    return [f"  balls at {places} mm in W; their residual is {result.balls_misfit:.2f} times what was stated"]

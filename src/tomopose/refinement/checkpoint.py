@@ -12,6 +12,7 @@ import numpy as np
 from tomopose.files import atomic_file
 from tomopose.kept import Key, StartsAnewWarning, digest_of_images, goes_on, key_of, write_key
 from tomopose.reconstruction.line_integrals import LineIntegrals
+from tomopose.refinement.joint_fit.balls import Balls
 from tomopose.refinement.joint_fit.fit import State
 from tomopose.refinement.prior import Prior
 from tomopose.refinement.settings import RefineSettings
@@ -38,6 +39,7 @@ def checkpoint_of(
     prior: Prior,
     settings: RefineSettings,
     levels: tuple[int, ...],
+    balls: Balls | None = None,
 ) -> Checkpoint | None:
     """The checkpoint in a folder, with the key of everything that the numbers depend on; None without a folder."""
     if folder is None:
@@ -53,6 +55,7 @@ def checkpoint_of(
         prior=prior.covariance,
         settings=replace(settings, threads=None, memory_gib=None),
         levels=levels,
+        balls=None if balls is None else {"z": balls.z, "root": balls.root, "radius_mm": balls.radius_mm},
     )
     return Checkpoint(Path(folder), key)
 

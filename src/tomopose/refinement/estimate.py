@@ -10,6 +10,7 @@ import scipy.linalg
 
 from tomopose.reconstruction.memory import BASE, memory_limit, padded_bytes
 from tomopose.refinement.checkpoint import Checkpoint, Reached
+from tomopose.refinement.joint_fit.balls import Balls
 from tomopose.refinement.joint_fit.fit import Fit, State, blank
 from tomopose.refinement.joint_fit.measured import Measured, crossed_edges, crossed_faces, rays_through
 from tomopose.refinement.joint_fit.motions import pixel_jacobian
@@ -69,13 +70,14 @@ def estimate(
     threads: int,
     steps: Steps,
     checkpoint: Checkpoint | None = None,
+    balls: Balls | None = None,
 ) -> Estimate:
     """Volume and poses, coarse to fine; what a level reached is kept in the checkpoint, and continued from there."""
     edges = crossed_edges(data)
     K = pixel_jacobian(data.matrices.P, points_of(data.grid), np.asarray(data.grid.centre))
     reached = None if checkpoint is None else checkpoint.resume(prior)
     while reached is None or not (reached.levels == len(factors) or said_already(reached, edges, K)):
-        reached = next_level(data, factors, prior, s, threads, steps, reached)
+        reached = next_level(data, factors, prior, s, threads, steps, reached, balls)
         if checkpoint is not None:
             checkpoint.keep(reached)
     return Estimate(
@@ -84,9 +86,16 @@ def estimate(
         faces=reached.faces,
         edges=edges,
         data=without_rays(data, reached.faces),
-        judged=max(factors[reached.levels - 1], min(2, factors[0])),
+        judged=judged_at(data, factors, factors[reached.levels - 1]),
         K=K,
     )
+
+
+def judged_at(data: Measured, factors: tuple[int, ...], finest: int) -> int:
+    """The binning at which the held-out pixels, the draws and the halves are taken: twice the finest that was fitted,
+    an eighth of its work, where enough pixels remain and no coarser than the coarsest."""
+    twice = min(2 * finest, factors[0])
+    return twice if min(data.matrices.n_u, data.matrices.n_v) // twice >= LEAST_PIXELS else finest
 
 
 def said_already(reached: Reached, edges: tuple[str, ...], K: Array) -> bool:
@@ -102,6 +111,7 @@ def next_level(
     threads: int,
     steps: Steps,
     reached: Reached | None,
+    balls: Balls | None = None,
 ) -> Reached:
     """The first level, from nothing, or the one after what was reached."""
     held = Fit(precision=None, steps=1, turns=s.turns, threads=threads)
@@ -112,8 +122,9 @@ def next_level(
         if faces:
             level = without_rays(level, faces)
             state = blank(level)
-        state = Fit(precision=prior.precision, steps=s.steps, turns=s.turns, threads=threads)(level, state)
-        prior = by_evidence(prior, state, most=np.inf)
+        fit = Fit(precision=prior.precision, steps=s.steps, turns=s.turns, threads=threads, balls=balls)
+        state = fit(level, state)
+        prior = by_evidence(prior, state, balls, most=np.inf)
         steps.done()
     else:
         prior, faces = reached.prior, reached.faces
@@ -122,17 +133,21 @@ def next_level(
         # the volume first: poses would follow what a coarse one lacks
         state = held(level, replace(reached.state, volume=finer(reached.state.volume, coarse, level.grid)))
     later = max(1, s.steps // 2)
-    state = Fit(precision=prior.precision, steps=later, turns=s.turns, threads=threads)(level, state)
+    fit = Fit(precision=prior.precision, steps=later, turns=s.turns, threads=threads, balls=balls)
+    state = fit(level, state)
     steps.done()
     levels = 1 if reached is None else reached.levels + 1
-    return Reached(levels=levels, state=state, prior=by_evidence(prior, state, most=LATER_LOOK), faces=faces)
+    prior = by_evidence(prior, state, balls, most=LATER_LOOK)
+    return Reached(levels=levels, state=state, prior=prior, faces=faces)
 
 
-def by_evidence(prior: Prior, state: State, *, most: float) -> Prior:
+def by_evidence(prior: Prior, state: State, balls: Balls | None, *, most: float) -> Prior:
     """The prior with the sizes that the state's motions show, and wider where a view jumps."""
     if state.information is None:
         return prior
     information = scipy.linalg.block_diag(*state.information) / VOLUME_UNKNOWN
+    if balls is not None:
+        information += balls.reduced(state.q)[0]
     return prior.by_evidence(state.q, information, most=most).with_jumps(state.q)
 
 

@@ -4,7 +4,7 @@ Every second view makes set A, the others set B; each is refined from the input 
 views of B are then matched to the volume of A, held as it is, and the poses that this gives are compared with those
 that B found itself; and the other way round.  Common motions, which no image shows, are removed from the differences.
 They hold what two independent volumes lead the views apart; each view's own noise is in both poses and is added from
-its information with the volume known.
+its information with the volume known.  Balls on the object take no part: it is the images' opinion alone.
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ def differences(data: Measured, prior: Prior, fit: Fit, K: Array) -> float:
     parts = [views_of(data, half) for half in rows]
     precisions = [prior.of_views(half).precision for half in rows]
     found = [
-        replace(fit, precision=precision)(part, blank(part)) for part, precision in zip(parts, precisions, strict=True)
+        replace(fit, precision=precision, balls=None)(part, blank(part))
+        for part, precision in zip(parts, precisions, strict=True)
     ]
     squares, count = 0.0, 0
     for own, other in ((0, 1), (1, 0)):

@@ -92,7 +92,7 @@ class Evidence:
     object crosses; left: share of the rays that do not meet what lies beyond them.  edges: of the images that the
     object crosses.  open_: directions that the images do not determine and that
     matter, as sentences.  moved: rms correction over its
-    rms standard uncertainty.
+    rms standard uncertainty.  balls: residual of the balls over their stated uncertainty, or None.
     """
 
     held_out: Trial
@@ -102,6 +102,7 @@ class Evidence:
     edges: tuple[str, ...]
     open_: tuple[str, ...]
     moved: float
+    balls: float | None = None
 
 
 def decide(e: Evidence) -> tuple[Verdict, tuple[str, ...]]:
@@ -122,6 +123,11 @@ def decide(e: Evidence) -> tuple[Verdict, tuple[str, ...]]:
         reasons.append(
             f"The residual is {e.chi:.1f} times the images' noise ({100 * misfit:.1f} % of the line integrals): the "
             "volume does not explain the images (object cut by the view or the grid, scatter, or wrong matrices)"
+        )
+    if e.balls is not None and e.balls > MISFIT:
+        reasons.append(
+            f"The balls' images are off by {e.balls:.1f} times their stated uncertainty: they do not move with the "
+            "object, or one was taken for another"
         )
     reasons += e.open_
     if reasons:

@@ -41,6 +41,8 @@ class Refinement(Tabular):
     halves_px:    standard uncertainty of a view, px per coordinate, by two disjoint sets of views refined apart; NaN
                   for fewer than 16 views.  stated_px: the stated one beside it, rms over views and points.
     volume_before, volume: volumes under both geometries, at the resolution of the comparison.
+    edge_blur_before_mm, edge_blur_after_mm: standard deviation, mm, of the blurred step in their mean profile across
+                  the edges, on the same lines; NaN where no edge can be measured.
     """
 
     matrices: ProjectionMatrices
@@ -64,6 +66,10 @@ class Refinement(Tabular):
     stated_px: float = float("nan")
     volume_before: Volume | None = None
     volume: Volume | None = None
+    edge_blur_before_mm: float = float("nan")
+    edge_blur_after_mm: float = float("nan")
+    balls: Array | None = None
+    balls_misfit: float = float("nan")
     provenance: Provenance | None = None
 
     def __len__(self) -> int:
@@ -132,8 +138,12 @@ def document(r: Refinement) -> dict[str, object]:
         "held_out_gain": r.held_out_gain,
         "prior_sizes": dict(r.prior_sizes),
         "sigma_over_volume_known": r.widening,
-        "halves_px": r.halves_px if np.isfinite(r.halves_px) else None,
-        "stated_px": r.stated_px if np.isfinite(r.stated_px) else None,
+        "halves_px": r.halves_px,
+        "stated_px": r.stated_px,
+        "edge_blur_before_mm": r.edge_blur_before_mm,
+        "edge_blur_after_mm": r.edge_blur_after_mm,
+        "balls": None if r.balls is None else [{"place_mm": x} for x in r.balls],
+        "balls_residual_over_sigma": r.balls_misfit,
         "jumps": [r.pose_id[j] for j in r.outliers],
         "views": views,
         "provenance": None if r.provenance is None else r.provenance.to_json(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +15,15 @@ from tomopose.engines.geometry import require_usable
 from tomopose.errors import InputError
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.manipulator.poses import PoseSequence
+from tomopose.observations import BallObservations
 from tomopose.provenance import provenance
 from tomopose.reconstruction.line_integrals import Correction, ImagesAre, require_contrast
 from tomopose.reconstruction.run import line_integrals_of
 from tomopose.refinement.checkpoint import checkpoint_of
 from tomopose.refinement.estimate import Estimate, Progress, Steps, estimate, levels_of
 from tomopose.refinement.halves import halves_px
+from tomopose.refinement.joint_fit.balls import Balls
+from tomopose.refinement.joint_fit.balls_seen import balls_of, without_shadows
 from tomopose.refinement.joint_fit.fit import Fit, linearised
 from tomopose.refinement.joint_fit.linear import normal_blocks
 from tomopose.refinement.joint_fit.measured import measured, rays_through
@@ -28,8 +32,16 @@ from tomopose.refinement.joint_fit.pyramid import level_of
 from tomopose.refinement.judge import Evidence, Verdict, decide, trial
 from tomopose.refinement.result import Refinement
 from tomopose.refinement.settings import OPEN_PX, RefineSettings
+from tomopose.refinement.sharpness import edge_blurs_mm
 from tomopose.refinement.stated import points_of, prior_of, radius_of
-from tomopose.refinement.uncertainty import drawn_errors, open_directions, size_sigma, spread_of, widening_of
+from tomopose.refinement.uncertainty import (
+    VOLUME_UNKNOWN,
+    drawn_errors,
+    open_directions,
+    size_sigma,
+    spread_of,
+    widening_of,
+)
 from tomopose.units import Array
 from tomopose.values import Images, require_types
 from tomopose.volume import Volume, VoxelGrid
@@ -51,6 +63,7 @@ def refine(
     calibration: Calibration | None = None,
     *,
     poses: PoseSequence | None = None,
+    balls: Sequence[BallObservations] = (),
     images_are: ImagesAre | None = None,
     correction: Correction | None = None,
     settings: RefineSettings | None = None,
@@ -67,6 +80,8 @@ def refine(
     calibration: with `poses` its covariance is the prior, correlated over the views; without them its residual, where
                  the matrices state no uncertainty.  Its scale is kept in any case.
     poses:       the scan's n poses, in the order of the matrices.
+    balls:       observations of balls on the object, a table for each ball, its pose ids those of the matrices.  Nobody
+                 need know where the balls sit: they join as points that move with the object, inside the grid or not.
     images_are:  "transmission", "line-integrals" or "counts"; never guessed.
     correction:  how images become line integrals (white level, bad pixels, beam hardening ...), as for `reconstruct`.
     settings:    levels, steps, held-out share, seed.
@@ -94,12 +109,15 @@ def refine(
     require_contrast(scan, sorted({0, len(scan) // 3, len(scan) // 2, len(scan) - 1}))
     data = measured(scan, grid, held_out=s.held_out, seed=s.seed)
     threads = s.threads or processors()
+    points = balls_of(balls, matrices, np.asarray(grid.centre)) if balls else None
+    if points is not None:
+        data = without_shadows(data, points)
     prior, stated = prior_of(matrices, grid, s, calibration, poses)
     factors = levels_of(data, s)
     steps = Steps(2 * len(factors) + 4, progress)
-    kept = checkpoint_of(checkpoint, scan, grid, prior, s, factors)
-    found = estimate(data, factors, prior, s, threads, steps, kept)
-    result = assessed(found, matrices, s, threads, steps)
+    kept = checkpoint_of(checkpoint, scan, grid, prior, s, factors, points)
+    found = estimate(data, factors, prior, s, threads, steps, kept, points)
+    result = assessed(found, matrices, s, threads, steps, points)
     steps.finish()
     if kept is not None:
         kept.remove()
@@ -108,7 +126,12 @@ def refine(
 
 
 def assessed(
-    found: Estimate, matrices: ProjectionMatrices, s: RefineSettings, threads: int, steps: Steps
+    found: Estimate,
+    matrices: ProjectionMatrices,
+    s: RefineSettings,
+    threads: int,
+    steps: Steps,
+    balls: Balls | None = None,
 ) -> Refinement:
     """What the estimate is worth: the judgement of the held-out pixels, the uncertainty, and what is not observable."""
     data, state, prior, K = found.data, found.state, found.prior, found.K
@@ -121,10 +144,12 @@ def assessed(
     here = linearised(level, at, threads=threads)
     information = normal_blocks(here.motions, here.weighed(level))
     left = 1.0 - float(rays_through(level, found.faces).mean()) if found.faces else 1.0
-    open_ = () if found.faces else open_directions(information, prior, K, radius)
-    errors = drawn_errors(level, at, here, prior, samples=s.samples, turns=s.turns, seed=s.seed)
-    widening = widening_of(errors, information, prior, K)
-    spread = spread_of(widening, information if state.information is None else state.information, prior, K)
+    finest = information if state.information is None else state.information
+    points = 0.0 if balls is None else balls.blocks(state.q)
+    open_ = () if found.faces else open_directions(information + VOLUME_UNKNOWN * points, prior, K, radius)
+    errors = drawn_errors(level, at, here, prior, samples=s.samples, turns=s.turns, seed=s.seed, balls=balls)
+    widening = widening_of(errors, information + points, prior, K)
+    spread = spread_of(widening, finest + points, prior, K)
     steps.done()
     moved_px = np.einsum("nmic,nc->nmi", K, state.q)
     moved = np.sqrt(np.mean(moved_px**2) / np.mean(spread.points_sigma**2))
@@ -139,6 +164,7 @@ def assessed(
             edges=found.edges,
             open_=tuple(each.words for each in open_ if each.left_px > OPEN_PX),
             moved=float(moved),
+            balls=None if balls is None else balls.misfit(state.q),
         )
     )
     shared = size_sigma(prior.stated, data.matrices.P, points_of(data.grid), centre)
@@ -148,6 +174,8 @@ def assessed(
         points_sigma=np.sqrt(spread.points_sigma**2 + shared**2),
         points_sigma_shared=shared,
     )
+    volumes = tuple(Volume(values=each.volume, grid=level.grid) for each in (before, after))
+    blurs = edge_blurs_mm(volumes[0], volumes[1])
     return Refinement(
         matrices=refined if verdict is Verdict.REFINED else matrices,
         corrections=state.q,
@@ -168,8 +196,12 @@ def assessed(
         widening=widening.factor,
         halves_px=halves,
         stated_px=float(np.sqrt(np.mean(spread.points_sigma**2))),
-        volume_before=Volume(values=before.volume, grid=level.grid),
-        volume=Volume(values=after.volume, grid=level.grid),
+        balls=None if balls is None else balls.places(state.q),
+        balls_misfit=float("nan") if balls is None else balls.misfit(state.q),
+        edge_blur_before_mm=blurs[0],
+        edge_blur_after_mm=blurs[1],
+        volume_before=volumes[0],
+        volume=volumes[1],
     )
 
 

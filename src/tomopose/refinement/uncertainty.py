@@ -12,7 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tomopose.refinement.joint_fit.fit import LEVEL_SIGMA, Linearised, State, ridge_of, with_levels
+from tomopose.refinement.joint_fit.balls import Balls
+from tomopose.refinement.joint_fit.fit import (
+    LEVEL_SIGMA,
+    Linearised,
+    State,
+    motions_among_levels,
+    ridge_of,
+    with_balls,
+    with_levels,
+)
 from tomopose.refinement.joint_fit.linear import Linear
 from tomopose.refinement.joint_fit.measured import Measured
 from tomopose.refinement.joint_fit.motions import gauge, pixel_jacobian, without_gauge
@@ -38,15 +47,25 @@ class Spread:
 
 
 def drawn_errors(
-    data: Measured, state: State, here: Linearised, prior: Prior, *, samples: int, turns: int, seed: int
+    data: Measured,
+    state: State,
+    here: Linearised,
+    prior: Prior,
+    *,
+    samples: int,
+    turns: int,
+    seed: int,
+    balls: Balls | None = None,
 ) -> Array:
     """Errors (samples, n, 6) of the motions that noise and prior of their own size make.  here: the data at `state`."""
     n, x, w = len(data.p), here.x, here.weighed(data)
     C, own = prior.covariance, prior.precision
     precision = with_levels(own)
     H = passed_frequencies(data.matrices, data.grid)
-    linear = Linear.of(here.engine, x > 0, here.J, w, precision, ridge_of(state.volume, state.chi), H)
-    rng, root = np.random.default_rng([seed, 21]), np.linalg.cholesky(C + 1e-15 * np.trace(C) * np.eye(len(C)))
+    system, _ = with_balls(precision, np.zeros(7 * n), balls, state.q)
+    linear = Linear.of(here.engine, x > 0, here.J, w, system, ridge_of(state.volume, state.chi), H)
+    rng, root = np.random.default_rng([seed, 21]), root_of(C)
+    root_of_balls = None if balls is None else root_of(balls.reduced(state.q)[0])
     G = gauge(data.matrices.P, np.asarray(data.grid.centre))
     sigma = np.where(w > 0, 1 / np.sqrt(np.maximum(w, 1e-30)), 0)
     errors = np.empty((samples, n, 6))
@@ -55,9 +74,17 @@ def drawn_errors(
         truth[:, :6] = (root @ rng.standard_normal(6 * n)).reshape(n, 6)
         truth[:, 6] = LEVEL_SIGMA * rng.standard_normal(n)
         noise = data.smooth((sigma * rng.standard_normal(sigma.shape)).astype(np.float32))
-        _, dq = linear.solve(noise, -(precision @ truth.ravel()), np.zeros_like(x), turns=turns)
+        pull = -(precision @ truth.ravel())
+        if root_of_balls is not None:
+            pull[motions_among_levels(n)] -= root_of_balls @ rng.standard_normal(6 * n)
+        _, dq = linear.solve(noise, pull, np.zeros_like(x), turns=turns)
         errors[k] = without_gauge(dq[:, :6], G, own)
     return errors
+
+
+def root_of(C: Array) -> Array:
+    """L with L L' = C, a covariance or precision that may leave directions open."""
+    return np.asarray(np.linalg.cholesky(C + 1e-12 * np.trace(C) / len(C) * np.eye(len(C))))
 
 
 @dataclass(frozen=True, kw_only=True)

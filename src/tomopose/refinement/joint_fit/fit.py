@@ -6,9 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from tomopose.engines.cpu import CpuEngine
 from tomopose.geometry.projection import ProjectionMatrices
+from tomopose.refinement.joint_fit.balls import Balls
 from tomopose.refinement.joint_fit.derivatives import integrals_with_derivatives
 from tomopose.refinement.joint_fit.linear import Linear, normal_blocks
 from tomopose.refinement.joint_fit.measured import Measured
@@ -107,10 +109,25 @@ def ridge_of(volume: np.ndarray, chi: float) -> float:
 def with_levels(precision: Array) -> Array:
     """The precision (7n, 7n) of motions, (6n, 6n), and levels of all views."""
     n = len(precision) // 6
-    whole = np.eye(7 * n) / LEVEL_SIGMA**2
-    at = (7 * np.arange(n)[:, None] + np.arange(6)).ravel()
+    whole, at = np.eye(7 * n) / LEVEL_SIGMA**2, motions_among_levels(n)
     whole[np.ix_(at, at)] = precision
     return whole
+
+
+def motions_among_levels(n: int) -> npt.NDArray[np.int_]:
+    """(6n,): where the motions are among the seven unknowns of each view."""
+    return np.asarray((7 * np.arange(n)[:, None] + np.arange(6)).ravel())
+
+
+def with_balls(precision: Array, pull: Array, balls: Balls | None, q: Array) -> tuple[Array, Array]:
+    """The precision (7n, 7n) and the pull (7n,) of motions and levels, with what the balls say at motions q."""
+    if balls is None:
+        return precision, pull
+    B, g = balls.reduced(q)
+    at, precision, pull = motions_among_levels(len(q)), precision.copy(), pull.copy()
+    precision[np.ix_(at, at)] += B
+    pull[at] -= g
+    return precision, pull
 
 
 def blank(data: Measured) -> State:
@@ -124,13 +141,14 @@ class Fit:
     """How a level is fitted.
 
     precision: (6n, 6n) of the motions' prior, or None to hold the poses and fit the volume and the images' levels.
-    steps, turns, threads: as in the settings.
+    steps, turns, threads: as in the settings.  balls: points that move with the object, or None.
     """
 
     precision: Array | None
     steps: int
     turns: int
     threads: int
+    balls: Balls | None = None
 
     def __call__(self, data: Measured, start: State) -> State:
         """Steps from `start` to a minimum of the joint cost, or until they are used up."""
@@ -156,12 +174,14 @@ class Fit:
         unknown = np.concatenate([state.q, state.offset[:, None]], axis=1)[:, 6 if held else 0 :]
         free = self._free(engine, x, w * r, first=first)
         ridge = 0.0 if first else ridge_of(state.volume, chi)
-        linear = Linear.of(engine, free, here.J, w, precision, ridge, H)
-        pull = precision @ unknown.ravel()
+        balls = None if held else self.balls
+        system, pull = with_balls(precision, precision @ unknown.ravel(), balls, state.q)
+        linear = Linear.of(engine, free, here.J, w, system, ridge, H)
         dx, dq = linear.solve(r, pull, x, turns=2 * self.turns if first else self.turns)
 
         def cost(volume: np.ndarray, values: Array, residual: Floats) -> float:
             own = float(values.ravel() @ precision @ values.ravel()) + ridge * float(np.vdot(volume, volume))
+            own += 0.0 if balls is None else balls.cost(values[:, :6])
             return float(np.einsum("np,np,np->", w, residual, residual, dtype=np.float64)) + own
 
         information = None if held else normal_blocks(here.motions, w)

@@ -21,7 +21,8 @@ AXES = ("x", "y", "z")
 class RefinedViews:
     """columns: as `Refinement.columns`; verdict, reasons, unobservable: in words; gain: of held-out pixels, standard
     errors; halves_px, stated_px: uncertainty of a view by two halves of the views refined apart, and as stated;
-    before, after: volumes under both geometries."""
+    edge_blur_mm: standard deviation of the edges in both volumes, NaN where none can be measured; before, after:
+    volumes under both geometries."""
 
     columns: Mapping[str, Sequence[object] | np.ndarray]
     verdict: str
@@ -30,6 +31,7 @@ class RefinedViews:
     gain: float
     halves_px: float
     stated_px: float
+    edge_blur_mm: tuple[float, float]
     before: Volume | None
     after: Volume | None
     provenance: Provenance | None
@@ -67,6 +69,7 @@ def refinement_report(views: RefinedViews, *, title: str = "Refinement report") 
                     note="Median, before and after; the second should be smaller.",
                     value=f"{before:.3g}, {after:.3g}",
                 ),
+                _blur(views.edge_blur_mm),
             ],
             sections=[
                 Section(title="Result", blocks=[Words(title="Why", items=views.reasons)]),
@@ -85,6 +88,21 @@ def refinement_report(views: RefinedViews, *, title: str = "Refinement report") 
             footer="Written by tomopose.",
         )
     )
+
+
+def _blur(blurs: tuple[float, float]) -> KeyFigure:
+    """The blur of the edges before and after, and how much of it was the geometry's."""
+    before, after = blurs
+    if not np.isfinite(blurs).all():
+        note = "No edge could be measured in both volumes."
+    elif before > after:
+        note = (
+            f"Standard deviation before and after: {np.sqrt(before**2 - after**2):.3g} mm were the views' errors. "
+            "Voxels and smoothing of the comparison are in both."
+        )
+    else:
+        note = "Standard deviation before and after; no edge became sharper."
+    return KeyFigure(name="Blur of the edges, mm", value=", ".join(f"{b:.3g}" for b in blurs), note=note)
 
 
 def _motions(c: Mapping[str, np.ndarray], kind: str, unit: str, name: str) -> Figure:
