@@ -4,7 +4,8 @@ Coarse on purpose: a panel read out in blocks (the box's walls need its pixels),
 few views.  The projections of a path are simulated once; each draw adds noise of its own, reconstructs, and measures by
 the plan.  Mean and scatter of the draws separate what is systematic (few views, cone beam, hardening, scatter,
 sampling) from what is random, and it is the random part that the prediction states: by filters, and through SART's own
-steps ("exact").  The scatter of few draws is itself uncertain; with --draws 0 only the two predictions are compared.
+steps ("exact"); "volume" takes these with the profiles and pixels of the scan with hardening and scatter in place of
+those of a part of one attenuation.  The scatter of few draws is itself uncertain; with --draws 0 the predictions alone.
 """
 
 from __future__ import annotations
@@ -22,8 +23,10 @@ import tomopose as tp
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.projection import ProjectionMatrices
+from tomopose.measurement.surface.splines import spline_coefficients
 from tomopose.planning.part.material_paths import material_paths
 from tomopose.planning.part.predict import predicted
+from tomopose.planning.part.sart_steps import SartSteps
 from tomopose.planning.part.worth import table
 from tomopose.planning.part_scan.paths import usual_paths
 from tomopose.planning.part_scan.plan import plan_part_scan
@@ -43,17 +46,18 @@ SWEEPS, SCATTER = 4, Scatter(amount=0.2, sigma=20.0)
 HALF_DRAWS = 2
 """Of the plan with half as many views, whose error is looked at and not its scatter."""
 HOLDS = (0.8, 1.25)
+WAYS = ("filters", "exact", "volume")
+"""Predicted by filters, through SART's own steps, and so with the profiles and the noise of the actual scan."""
 PATHS = ("plan", "half", "circular")
 """half: planned with half as many views."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lengths:
-    """Of one path: length -> values of the draws minus the nominal one, and u predicted by filters and exactly, mm."""
+    """Of one path: length -> values of the draws minus the nominal one, mm;  predicted: way -> length -> u, mm."""
 
     errors: dict[str, list[float]]
-    u: dict[str, float]
-    exact: dict[str, float]
+    predicted: dict[str, dict[str, float]]
 
     @property
     def rms(self) -> float:
@@ -135,13 +139,33 @@ def scanned(case: Case, task: Setting, q: Array, draws: int) -> Lengths:
     mu = apparent_mu(case, P[:: max(len(P) // 8, 1)], signals[:: max(len(P) // 8, 1)])
     shown = replace(task.settings, mu=mu, sweeps=SWEEPS, room=ROOM * spacing(task))
     goal = replace(replace(task, features=case.lengths).goal(judged=True), settings=shown)
-    ways = (goal, replace(goal, settings=replace(shown, exact=True))) if draws != HALF_DRAWS else ()
-    u, exact = ([predicted(w, s, P, table(w, P), plan=case.lengths)[1] for w in ways] + [{}, {}])[:2]
-    return Lengths(errors=errors, u=u, exact=exact)
+    if draws == HALF_DRAWS:
+        return Lengths(errors=errors, predicted={})
+    mean = tp.reconstruct(
+        [x * run.detector.white for x in signals],
+        matrices,
+        grid(case, task),
+        algorithm=SART(iterations=SWEEPS),
+        correction=levels,
+        consistency="off",
+    )
+    actual = SartSteps(
+        matrices=matrices,
+        variance=1 / (task.settings.quanta * np.stack(signals)),
+        box=grid(case, task),
+        coefficients=spline_coefficients(mean.values),
+        sweeps=SWEEPS,
+    )
+    ways = ((shown, None), (replace(shown, exact=True), None), (shown, actual))
+    found = [
+        predicted(replace(goal, settings=how), s, P, table(goal, P), plan=case.lengths, response=response)[1]
+        for how, response in ways
+    ]
+    return Lengths(errors=errors, predicted=dict(zip(WAYS, found, strict=True)))
 
 
 def compare(name: str, case: Case, task: Setting, draws: int, wanted: Sequence[str]) -> list[tuple[float, ...]]:
-    """Prints errors and scatter of every length along the wanted paths; returns (scatter, u by filters, exact u)."""
+    """Prints errors and scatter of every length along the wanted paths; returns (scatter, u by each way)."""
     task = replace(task, scanner=task.scanner.binned(case.binning), features=case.lengths)
     coarse = replace(task.settings, alpha_step=math.radians(6.0), tilt_step=math.radians(5.0))
     task = replace(task, settings=coarse)
@@ -156,10 +180,9 @@ def compare(name: str, case: Case, task: Setting, draws: int, wanted: Sequence[s
             print(f"{name:<9} {path:<9}{len(q):>3}  not measurable: {error}", flush=True)
             continue
         for length, values in found.errors.items():
-            mean = f"{1000 * np.mean(values):9.1f}" if values else f"{'':9}"
-            row = found.scatter(length), found.u.get(length, math.nan), found.exact.get(length, math.nan)
-            text = "" if path == "half" else "".join(f"{1000 * x:8.2f}" for x in row) + f"{row[1] / row[2]:7.2f}"
-            text += f"{row[1] / row[0]:7.2f}{row[2] / row[0]:7.2f}" if math.isfinite(row[0]) else ""
+            mean = f"{1000 * np.mean(values):9.1f}" if values else " " * 9
+            row = found.scatter(length), *(found.predicted.get(way, {}).get(length, math.nan) for way in WAYS)
+            text = "" if path == "half" else "".join(" " * 8 if math.isnan(x) else f"{1000 * x:8.2f}" for x in row)
             print(f"{name:<9} {path:<9}{len(q):>3}  {length:<18}{mean}{text}", flush=True)
             rows += [row] if path != "half" else []
         rms = f"rms error {1000 * found.rms:.0f} um, " if all(found.errors.values()) else ""
@@ -168,7 +191,7 @@ def compare(name: str, case: Case, task: Setting, draws: int, wanted: Sequence[s
 
 
 def _held(words: str, ratios: np.ndarray) -> None:
-    ratios = ratios[~np.isnan(ratios)]
+    ratios = ratios[np.isfinite(ratios) & (ratios > 0)]
     if len(ratios):
         held = (ratios >= HOLDS[0]) & (ratios <= HOLDS[1])
         low, middle, high = np.percentile(ratios, [5, 50, 95])
@@ -186,15 +209,14 @@ def perfect(draws: int) -> float:
 
 def compare_all(cases: dict[str, tuple[Case, Setting]], draws: int, wanted: Sequence[str]) -> None:
     """All parts: mean error, scatter, predicted scatter in um by filters and exactly; how many hold."""
-    print(
-        f"{draws} draws, {SWEEPS} sweeps of SART; mean error; scatter of the draws; predicted by filters; exact, um; "
-        "filters / exact; filters / draws; exact / draws"
-    )
+    print(f"{draws} draws, {SWEEPS} sweeps of SART; mean error; scatter of the draws; u by {', by '.join(WAYS)}, um")
     rows = [r for name, (case, task) in cases.items() for r in compare(name, case, task, draws, wanted)]
-    scatter, u, exact = np.array(rows).reshape(-1, 3).T
+    scatter, filters, exact, volume = np.array(rows).reshape(-1, 1 + len(WAYS)).T
     with np.errstate(invalid="ignore"):
-        _held("filters / exact", u / exact)
+        _held("filters / volume", filters / volume)
+        _held("exact / volume", exact / volume)
         if draws > HALF_DRAWS:
-            _held("filters / draws", u / scatter)
+            _held("filters / draws", filters / scatter)
             _held("exact / draws", exact / scatter)
+            _held("volume / draws", volume / scatter)
             print(f"a perfect prediction would hold in {100 * perfect(draws):.0f} % of the cases with {draws} draws")

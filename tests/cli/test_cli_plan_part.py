@@ -157,7 +157,7 @@ def test_the_defaults_of_the_options_are_those_of_the_library():
     for option, degrees in {"tangent": True, "tuy": True, "least_transmission": False, "margin": False}.items():
         there = getattr(settings, {"tuy": "tuy_width"}.get(option, option))
         assert getattr(options, option) == pytest.approx(np.degrees(there) if degrees else there), option
-    for option in ("quanta", "blur", "seed"):
+    for option in ("quanta", "blur", "seed", "sweeps", "room", "exact"):
         assert getattr(options, option) == getattr(settings, option), option
 
 

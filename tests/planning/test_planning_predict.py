@@ -20,7 +20,7 @@ from tomopose.planning.part import sart_steps as sart_steps_module
 from tomopose.planning.part.part import Part
 from tomopose.planning.part.predict import _lengths, _slopes, predicted
 from tomopose.planning.part.sart_response import RELAXATION, Blocks, blocks, sart_response
-from tomopose.planning.part.sart_steps import sart_steps, weights_on_pixels
+from tomopose.planning.part.sart_steps import SartSteps, sart_steps, weights_on_pixels
 from tomopose.planning.part.settings import PartSettings
 from tomopose.planning.part.targets import probed_targets
 from tomopose.planning.part.worth import table
@@ -144,13 +144,15 @@ def test_the_exact_prediction_is_near_that_by_filters_and_falls_with_the_quanta(
     setting = task(features=features)
     P = tilted_turn(setting)
 
-    def height(**changed: object) -> float:
+    def height(response: SartSteps | None = None, **changed: object) -> float:
         goal = replace(setting.goal(), settings=replace(setting.settings, **changed))
-        return predicted(goal, setting.scanner, P, table(goal, P), plan=features)[1]["height"]
+        return predicted(goal, setting.scanner, P, table(goal, P), plan=features, response=response)[1]["height"]
 
     exact = height(exact=True)
     assert exact / height() == pytest.approx(1.0, abs=0.35)
     assert exact / height(exact=True, quanta=8.0e4) == pytest.approx(2.0, rel=1e-6)
+    noisier = sart_steps(setting.part, setting.scanner, P, setting.settings)
+    assert height(replace(noisier, variance=9 * noisier.variance)) == pytest.approx(3 * exact, rel=1e-6)
 
 
 FEATURES = {

@@ -28,8 +28,8 @@ from tomopose.measurement.features.shapes import frame_along
 from tomopose.measurement.measure import evaluate
 from tomopose.measurement.plan import MeasurandPlan, MeasurementPlan
 from tomopose.planning.part.expected_edges import FEWEST_EDGES, ExpectedEdges, expected_edges
-from tomopose.planning.part.sart_response import sart_response
-from tomopose.planning.part.sart_steps import sart_steps
+from tomopose.planning.part.sart_response import SartResponse, sart_response
+from tomopose.planning.part.sart_steps import SartSteps, sart_steps
 from tomopose.planning.part.targets import Target, probed_targets
 from tomopose.planning.part.worth import Goal, Views
 from tomopose.trajectory.completeness import source_path
@@ -67,12 +67,14 @@ def predicted(
     *,
     plan: MeasurementPlan | None = None,
     shared: Array | None = None,
+    response: SartResponse | SartSteps | None = None,
 ) -> tuple[list[Predicted], dict[str, float]]:
     """(each target, standard uncertainty in mm of each distance and diameter of the plan).
 
-    shared: (targets,) mm, what the calibration adds to the place of each, in quadrature.
+    shared: (targets,) mm, what the calibration adds to the place of each, in quadrature.  response: what SART makes of
+    the views; unless given, of the part alone, by filters or, where the settings say so, exactly.
     """
-    u, sizes, lengths = _from_noise(goal, scanner, P, plan)
+    u, sizes, lengths = _from_noise(goal, scanner, P, plan, response)
     own = np.zeros(len(goal.targets)) if shared is None else shared
     out = []
     for k, target in enumerate(goal.targets):
@@ -97,7 +99,11 @@ def predicted(
 
 
 def _from_noise(
-    goal: Goal, scanner: Scanner, P: Array, plan: MeasurementPlan | None
+    goal: Goal,
+    scanner: Scanner,
+    P: Array,
+    plan: MeasurementPlan | None,
+    response: SartResponse | SartSteps | None,
 ) -> tuple[Array, Array, dict[str, float]]:
     """(u of the place, u of the radius) (targets,) and of the lengths, mm, from the noise alone."""
     if plan is not None and plan.features:
@@ -108,7 +114,8 @@ def _from_noise(
     if not (depth > 0).all():
         nothing = np.full(len(targets), np.inf)
         return nothing, nothing, {m.name: np.inf for m in wanted}
-    response = (sart_steps if goal.settings.exact else sart_response)(goal.part, scanner, P, goal.settings)
+    if response is None:
+        response = (sart_steps if goal.settings.exact else sart_response)(goal.part, scanner, P, goal.settings)
     edges = {t.name: expected_edges(response, t.x, t.n) for t in targets}
     rows: list[csr_array] = []
     for target in targets:
