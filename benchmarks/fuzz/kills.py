@@ -163,11 +163,13 @@ def left_by(name: str, place: Path, states: list[dict[str, str]], number: signal
 
 
 def read_log(path: Path | None) -> list[dict[str, object]]:
-    """The kills of an interrupted run; a line that was cut off is repeated."""
+    """The kills of an interrupted run.  A line that was cut off is taken out of the log, and its kill is repeated."""
     rows: list[dict[str, object]] = []
-    for line in path.read_text().splitlines() if path is not None and path.exists() else ():
-        with contextlib.suppress(ValueError):
-            rows.append(json.loads(line))
+    if path is not None and path.exists():
+        for line in path.read_text().splitlines():
+            with contextlib.suppress(ValueError):
+                rows.append(json.loads(line))
+        path.write_text("".join(json.dumps(row) + "\n" for row in rows))
     return rows
 
 

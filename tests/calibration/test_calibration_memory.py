@@ -47,7 +47,7 @@ def test_four_times_the_poses_take_four_times_the_memory(scanner, T_HT):
     peak_of_a_calibration(scanner, T_HT, 20)  # what is imported and compiled once is not a calibration's
     few, many = (peak_of_a_calibration(scanner, T_HT, n) for n in (100, 400))
     assert many < 5 * few
-    # Measured: 11 kB a centre of these few, and BIGGER kB of every further one, where rows are looked at in parts.
+    # Measured: 8 kB a centre of these few, and 3.4 kB of 80,000, where rows are looked at in parts.
     assert many < 13_000 * 400 * BALLS
 
 
@@ -56,7 +56,7 @@ def test_a_centre_takes_the_memory_of_its_own_ball_and_not_of_all(scanner, T_HT,
     monkeypatch.setattr(tall, "PART", 128)
     peak_of_a_calibration(scanner, T_HT, 20, 4)
     peaks = [peak_of_a_calibration(scanner, T_HT, 2400 // balls, balls) for balls in (4, 24)]
-    assert peaks[1] < 1.5 * peaks[0]
+    assert peaks[1] < 1.3 * peaks[0]  # measured: 1.17; with tables of all balls 1.46
 
 
 def test_many_balls_looked_at_in_parts_give_the_same_calibration(scanner, T_HT, monkeypatch):

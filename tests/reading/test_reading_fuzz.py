@@ -40,3 +40,14 @@ def test_a_killed_writer_leaves_the_old_or_the_new_result(tmp_path, name):
 
     _, left = kill_once(name, tmp_path, random.Random(name))
     assert left in ("old", "new", "resumed")
+
+
+@pytest.mark.usefixtures("_fuzz_path")
+def test_kills_continue_after_the_last_whole_line_of_their_log(tmp_path):
+    from kills import read_log
+
+    log = tmp_path / "kills.jsonl"
+    log.write_text('{"seed": 1, "kill": 0, "left": "old"}\n{"seed": 1, "kill": 1, "le')
+    assert read_log(log) == [{"seed": 1, "kill": 0, "left": "old"}]
+    assert log.read_text() == '{"seed": 1, "kill": 0, "left": "old"}\n'
+    assert read_log(tmp_path / "none") == []
