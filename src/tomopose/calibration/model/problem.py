@@ -116,7 +116,11 @@ class Problem:
 
     def with_covariance(self, covariance: Array) -> Problem:
         """The same centres with other covariances (n, 2, 2)."""
-        return replace(self, covariance=covariance, W=whiteners(covariance))
+        other = replace(self, covariance=covariance, W=whiteners(covariance))
+        for name in ("s_0", "poses", "T_MH"):  # what was calculated of the poses is theirs too
+            if name in vars(self):
+                vars(other)[name] = vars(self)[name]
+        return other
 
 
 def elapsed(problem: Problem) -> Array:

@@ -97,6 +97,7 @@ def scanner_tests(problem: Problem, free: FreeParameters, fit: Fit, b: Projectio
     columns, steps = effects_of(problem, b), steps_of(problem, b)
     freed = set(free.names)
     beside = ranked_explanations(problem, white, [c for c in columns if c.effect.name not in freed], steps)
+    del white, columns  # of very many rows they are large
     kept = [name for name, s in zip(free.names, free.sigma, strict=True) if np.isinf(s)]
     held = free_parameters(
         problem.scanners,
@@ -117,6 +118,7 @@ def scanner_tests(problem: Problem, free: FreeParameters, fit: Fit, b: Projectio
     before = whitened(problem, held, plain, b_held)
     effects = [*effects_of(problem, b_held), pixel_origin(problem)]
     declared = ranked_explanations(problem, before, effects, steps, most=1)
+    del effects, steps, b_held
     known = np.isfinite(free.sigma)
     C = (problem.W @ (b.J_scanner[:, :, free.cols[known]] * (free.factor * free.sigma)[known])).reshape(
         2 * len(problem), -1
