@@ -26,7 +26,7 @@ from tomopose.planning.part_scan.paths import usual_paths
 from tomopose.planning.part_scan.plan import plan_part_scan
 from tomopose.planning.part_scan.robot_at_work import RobotAtWork
 from tomopose.planning.part_scan.setting import Setting
-from tomopose.planning.part_scan.stations import allowed, stations
+from tomopose.planning.part_scan.stations import allowed, stations, turns
 from tomopose.trajectory.completeness import source_path
 from tomopose.trajectory.feasibility import TravelLimits
 
@@ -154,6 +154,16 @@ def test_a_robot_without_a_table_turns_the_part_itself() -> None:
     circle = source_path(plan.machine.matrices(usual_paths(plan.machine, 12)["circular"]))
     assert np.ptp(circle[:, 2]) < 1e-6
     assert np.ptp(np.arctan2(circle[:, 1], circle[:, 0])) > math.radians(300.0)
+
+
+def test_a_plate_without_limits_of_rz_turns_the_part_once() -> None:
+    travel = default_travel()
+    low, high = travel.low.copy(), travel.high.copy()
+    low[5:], high[5:] = [-math.inf, 0.0], [math.inf, 0.5]
+    machine = setting(limits=ScanLimits(travel=TravelLimits(low=low, high=high))).machine
+    found = turns(machine, math.radians(30.0))
+    np.testing.assert_allclose(np.diff(found), math.radians(30.0))
+    assert len(found) == 12
 
 
 def test_what_a_robot_cannot_do_is_said_in_words() -> None:

@@ -99,7 +99,8 @@ class Machine:
         """rad: by how much the plate can turn the part about the table's axis where the table cannot: rz."""
         if self.turns_freely or abs(self.T_HT.R[2, 2]) < UPRIGHT:
             return 0.0, 0.0
-        ends = np.sort(np.sign(self.T_HT.R[2, 2]) * np.array([self.limits.low[5], self.limits.high[5]]))
+        rz = np.clip([self.limits.low[5], self.limits.high[5]], -FULL_TURN / 2, FULL_TURN / 2)
+        ends = np.sort(np.sign(self.T_HT.R[2, 2]) * rz)
         return float(ends[0]), float(ends[1])
 
     def matrices(self, q: Array) -> Array:
