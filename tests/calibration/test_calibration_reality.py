@@ -281,6 +281,16 @@ def test_halves_of_the_poses_differ_by_what_is_stated_and_by_more_where_the_mode
     assert any(f.rule == "halves of the poses" and f.verdict == "doubtful" for f in wrong.checks)
 
 
+def test_rounding_has_no_say_in_how_likely_the_difference_of_the_halves_is():
+    """With the table still the halves take many directions from the priors: there they differ by rounding."""
+    poses = paper_poses()
+    seen = observe(poses)
+    backwards = poses[list(range(len(poses)))[::-1]]
+    one, other = (tp.calibrate(SILENT, p, seen, hypotheses=False).halves.p for p in (poses, backwards))
+    assert 1e-3 < one < 1.0
+    assert other == pytest.approx(one, rel=1e-3)
+
+
 def test_halves_survive_the_file(tmp_path):
     poses = mixed_poses(n=40)
     cal = tp.calibrate(SCANNER, poses, observe(poses), hypotheses=False)
