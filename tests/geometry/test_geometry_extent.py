@@ -24,3 +24,16 @@ def test_points_on_a_circle_keep_all_their_pairs():
 
 def test_one_point_or_none_has_no_extent():
     assert largest_distance(np.ones((1, 3))) == largest_distance(np.ones((0, 3))) == 0.0
+
+
+def test_few_points_of_a_long_course_are_compared_in_pairs(rng, monkeypatch):
+    from tomopose.geometry import extent
+
+    tau = np.linspace(-1, 1, 3000)
+    course = np.polynomial.legendre.legvander(tau, 3)[:, 1:] @ rng.normal(size=(3, 3))
+    compared = []
+    einsum = np.einsum
+    monkeypatch.setattr(extent.np, "einsum", lambda *a: compared.append(a[1].shape[0] * a[1].shape[1]) or einsum(*a))
+    found = largest_distance(course)
+    assert sum(compared) < 3000**2 / 10
+    assert found == pytest.approx(pdist(course).max(), rel=1e-12)

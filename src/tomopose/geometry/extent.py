@@ -6,8 +6,8 @@ import numpy as np
 
 from tomopose.units import Array
 
-PAIRS = 200_000
-"""Pairs compared at a time: a few MB, however many points there are."""
+BLOCK = 128
+"""Neighbours that are compared with others at a time: 16,384 pairs, however many points there are."""
 
 
 def largest_distance(points: Array) -> float:
@@ -21,8 +21,15 @@ def largest_distance(points: Array) -> float:
     radius = np.linalg.norm(x - x.mean(axis=0), axis=1)
     largest = float(np.linalg.norm(x - x[int(np.argmax(radius))], axis=1).max())
     outer = x[radius + radius.max() >= largest * (1 - 1e-12)]
-    rows = max(1, PAIRS // len(outer))
-    for start in range(0, len(outer), rows):
-        away = outer[start : start + rows, None] - outer[None, start:]
-        largest = max(largest, float(np.sqrt(np.einsum("ijk,ijk->ij", away, away).max())))
+    # neighbours in blocks: two blocks whose points cannot be farther apart than what was found are not compared
+    blocks = [outer[k : k + BLOCK] for k in range(0, len(outer), BLOCK)]
+    middle = np.array([b.mean(axis=0) for b in blocks])
+    reach = np.array([np.linalg.norm(b - m, axis=1).max() for b, m in zip(blocks, middle, strict=True)])
+    for k, block in enumerate(blocks):
+        bound = np.linalg.norm(middle[k:] - middle[k], axis=1) + reach[k:] + reach[k]
+        for j in np.argsort(-bound):
+            if bound[j] < largest * (1 - 1e-12):
+                break
+            away = block[:, None] - blocks[k + j][None]
+            largest = max(largest, float(np.sqrt(np.einsum("ijk,ijk->ij", away, away).max())))
     return largest
