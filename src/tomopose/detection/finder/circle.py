@@ -10,7 +10,6 @@ import numpy as np
 from numba import njit
 
 from tomopose.detection.order_statistics import median
-from tomopose.units import Array
 
 RAYS = 72
 COS, SIN = np.cos(2 * np.pi * np.arange(RAYS) / RAYS), np.sin(2 * np.pi * np.arange(RAYS) / RAYS)
@@ -25,14 +24,14 @@ STILL = 0.002
 
 @njit(cache=True, error_model="numpy")
 def check_circle(image, u, v, low, high, sign, aspect, noise, tightness, wide, rays):  # type: ignore[no-untyped-def]
-    """(found, u, v, radius, complete, visible) of the circle near (u, v) with radius in [low, high].
+    """(found, u, v, radius, complete, visible, contrast) of the circle near (u, v) with radius in [low, high].
 
     sign: +1 for a ball darker than its surroundings, -1 for a brighter one.  noise: standard deviation of a pixel.
     tightness: deviation from the circle, in radii, up to which a ray agrees.  wide: samples on either side of an edge
     that are compared.  rays: RaySettings as a plain tuple.
     """
     significant, fewest, most_hidden, weak, least_tolerance, least_agreeing = rays
-    nothing = (False, 0.0, 0.0, 0.0, 0.0, 0.0)
+    nothing = (False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     edge, strength, seen = np.empty(RAYS), np.empty(RAYS), np.empty(RAYS, np.bool_)
     x, y, deviation, part = np.empty(RAYS), np.empty(RAYS), np.empty(RAYS), np.empty(RAYS)
     radius, tolerance, n, n_seen = 0.0, 0.0, 0, 0
@@ -76,7 +75,7 @@ def check_circle(image, u, v, low, high, sign, aspect, noise, tightness, wide, r
     complete = agree / max(n_seen, 1)
     if median(deviation[:n]) > 0.5 * tolerance:
         complete *= 0.5
-    return True, u, v, radius, complete, n_seen / RAYS
+    return True, u, v, radius, complete, n_seen / RAYS, _disc_contrast(image, u, v, radius, sign, aspect)
 
 
 @njit(cache=True, error_model="numpy")
@@ -171,40 +170,58 @@ def _robust_circle(x, y, start):  # type: ignore[no-untyped-def]
     return cx, cy, radius
 
 
-def disc_contrast(image: Array, u: float, v: float, radius: float, sign: float, aspect: float) -> float:
+@njit(cache=True, error_model="numpy")
+def _disc_contrast(image, u, v, radius, sign, aspect):  # type: ignore[no-untyped-def]
     """How much darker (sign +1) the middle is than the surroundings; not positive for a ring or a hole."""
-    r = np.array([[0.25 * radius], [0.5 * radius], [radius + max(0.15 * radius, 2.0)]])
-    x, y = u + r * COS, v + r * SIN / aspect
-    seen = (x >= -0.5) & (x < image.shape[1] - 0.5) & (y >= -0.5) & (y < image.shape[0] - 0.5)
-    if not (seen[:2].any() and seen[2].any()):
+    sample, n_disc, n_around = np.empty((2, 2 * RAYS)), 0, 0
+    for r in (0.25 * radius, 0.5 * radius, radius + max(0.15 * radius, 2.0)):
+        for k in range(RAYS):
+            x, y = u + r * COS[k], v + r * SIN[k] / aspect
+            if not (-0.5 <= x < image.shape[1] - 0.5 and -0.5 <= y < image.shape[0] - 0.5):
+                continue
+            i, j = round(x), round(y)
+            if r < radius:
+                sample[0, n_disc] = image[j, i]
+                n_disc += 1
+            else:
+                sample[1, n_around] = image[j, i]
+                n_around += 1
+    if n_disc == 0 or n_around == 0:
         return 0.0
-    i, j = np.rint(np.where(seen, x, 0.0)).astype(np.int64), np.rint(np.where(seen, y, 0.0)).astype(np.int64)
-    values = image[j, i].astype(np.float64)
-    return sign * float(np.median(values[2][seen[2]]) - np.median(values[:2][seen[:2]]))
+    return sign * (median(sample[1, :n_around]) - median(sample[0, :n_disc]))
 
 
-def rim_blur(image: Array, u: float, v: float, radius: float, aspect: float, sign: float) -> float:
+@njit(cache=True, error_model="numpy")
+def rim_blur(image, u, v, radius, aspect, sign):  # type: ignore[no-untyped-def]
     """Standard deviation, px, of the blur of a circle's rim, from the steepest slope of the mean profile across it.
 
     A step of height h blurred by sigma has the slope h / (sqrt(2 pi) sigma); it is taken over half of the blur on
     either side.  0 where there is no slope.
     """
     n = int(2.0 * radius) + 9
-    x, y = u + np.outer(COS, np.arange(n)), v + np.outer(SIN, np.arange(n)) / aspect
-    ray, q = np.nonzero((x >= 0.0) & (x < image.shape[1] - 1.0) & (y >= 0.0) & (y < image.shape[0] - 1.0))
-    x, y = x[ray, q], y[ray, q]
-    i, j = x.astype(np.int64), y.astype(np.int64)
-    before = image[j, i] + (x - i) * (image[j, i + 1] - image[j, i])
-    after = image[j + 1, i] + (x - i) * (image[j + 1, i + 1] - image[j + 1, i])
-    total, count = np.bincount(q, before + (y - j) * (after - before), n), np.bincount(q, minlength=n)
+    total, count = np.zeros(n), np.zeros(n)
+    for k in range(RAYS):
+        for q in range(n):
+            x, y = u + q * COS[k], v + q * SIN[k] / aspect
+            if 0.0 <= x < image.shape[1] - 1.0 and 0.0 <= y < image.shape[0] - 1.0:
+                total[q] += _between_pixels(image, x, y)
+                count[q] += 1.0
     deep, far = int(0.3 * radius) + 1, int(1.5 * radius)
-    profile = total / np.maximum(count, 1)
-    inside, outside = float(profile[:deep].sum()) / min(deep, n), float(total[far:].sum()) / max(count[far:].sum(), 1)
-    height, blur, apart = sign * (outside - inside), 0.0, 1
+    inside, outside, n_outside = 0.0, 0.0, 0.0
+    for q in range(n):
+        if q >= far:
+            outside += total[q]
+            n_outside += count[q]
+        total[q] /= max(count[q], 1.0)
+        if q < deep:
+            inside += total[q]
+    height = sign * (outside / max(n_outside, 1.0) - inside / min(deep, n))
+    blur, apart = 0.0, 1
     for _ in range(3):
-        at = np.arange(max(int(0.5 * radius), apart), min(n - apart, int(1.5 * radius) + 3))
-        at = at[(count[at - apart] > 0) & (count[at + apart] > 0)]
-        steepest = float((sign * 0.5 / apart * (profile[at + apart] - profile[at - apart])).max(initial=0.0))
+        steepest = 0.0
+        for q in range(max(int(0.5 * radius), apart), min(n - apart, int(1.5 * radius) + 3)):
+            if count[q - apart] > 0.0 and count[q + apart] > 0.0:
+                steepest = max(steepest, sign * 0.5 / apart * (total[q + apart] - total[q - apart]))
         if not (steepest > 0.0 and height > 0.0):
             return blur
         blur = height / (math.sqrt(2.0 * math.pi) * steepest)

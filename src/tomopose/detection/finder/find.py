@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tomopose.detection.finder.circle import STEP, WIDE, check_circle, disc_contrast, rim_blur
+from tomopose.detection.finder.circle import STEP, WIDE, check_circle, rim_blur
 from tomopose.detection.finder.symmetry_votes import BANDS, LARGEST, SMALLEST, block_mean, circle_centres
 from tomopose.detection.settings import FinderSettings
 from tomopose.errors import AmbiguousBallError, BallNotFoundError, BallTruncatedError
@@ -241,14 +241,13 @@ def _checked(
     width: share of the radius by which it may differ; wide: samples of a ray that are compared, at least WIDE.
     """
     level, u, v = _around(search, c, factor, width)
-    shift, radius, sign = (factor - 1) / 2, c.radius / factor, -1.0 if c.bright else 1.0
-    yes, x, y, radius, complete, visible = check_circle(
+    shift, radius = (factor - 1) / 2, c.radius / factor
+    yes, x, y, radius, complete, visible, contrast = check_circle(
         level, (c.u - u - shift) / factor, (c.v - v - shift) / factor, radius * (1 - width), radius * (1 + width),
-        sign, search.aspect, 0.0, tightness, max(wide, WIDE), tuple(search.settings.rays),
+        -1.0 if c.bright else 1.0, search.aspect, 0.0, tightness, max(wide, WIDE), tuple(search.settings.rays),
     )  # fmt: skip
     if not yes or complete < search.settings.complete:
         return None
-    contrast = disc_contrast(level, x, y, radius, sign, search.aspect)
     return Candidate(u=x * factor + shift + u, v=y * factor + shift + v, radius=radius * factor, complete=complete,
                      visible=visible, contrast=contrast, bright=c.bright, merit=c.merit)  # fmt: skip
 
@@ -280,13 +279,10 @@ def _on_level(level: Array, factor: int, search: _Search) -> list[Candidate]:
     )
     for u, v, band, polarity, _votes in centres.tolist():
         (low, high), sign = BANDS[int(band)], -1.0 if polarity == 1 else 1.0
-        yes, x, y, radius, complete, visible = check_circle(
+        yes, x, y, radius, complete, visible, contrast = check_circle(
             level, u, v, 0.75 * low, 1.3 * high, sign, search.aspect, noise, settings.round_coarse, WIDE, rays
         )
-        if not (yes and complete >= settings.complete):
-            continue
-        contrast = disc_contrast(level, x, y, radius, sign, search.aspect)
-        if contrast > 0:
+        if yes and complete >= settings.complete and contrast > 0:
             shift = (factor - 1) / 2
             found.append(
                 Candidate(u=x * factor + shift, v=y * factor + shift, radius=radius * factor, complete=complete,

@@ -22,7 +22,8 @@ SHORT = 0.139
 """What a cut 1.5 standard deviations above it takes from a normal mean: phi(1.5) / Phi(1.5)."""
 
 
-def excess_variance(square: float, freedom: float, rare: float) -> float:
+@njit(cache=True)
+def excess_variance(square, freedom, rare):  # type: ignore[no-untyped-def]
     """Mean square of so many residuals in standard deviations, brought down to 1 so far as chance may have raised it.
 
     What is above 1 counts by the probability that there is more than noise: the likelihood ratio at its maximum,

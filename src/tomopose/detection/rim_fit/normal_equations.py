@@ -5,7 +5,6 @@ A sector's pixels see the shape, w and the two nodes at its sides: 14 parameters
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import NamedTuple
 
@@ -16,9 +15,6 @@ from tomopose.detection.rim_fit.state import Indices, RimFit, Unknowns, active_p
 from tomopose.detection.rim_model.ring import SHELLS
 from tomopose.detection.rim_model.rows import FIRST_NODE, KAPPA, LOCAL, WHITE
 from tomopose.units import Array
-
-LOWER = np.tril_indices(LOCAL)
-"""Of a sector's block: its lower triangle."""
 
 
 class Equations(NamedTuple):
@@ -63,23 +59,12 @@ def with_gradient(fit: RimFit, unknowns: Unknowns, known: Equations) -> Equation
 
 def with_priors(fit: RimFit, of: Equations, unknowns: Unknowns) -> tuple[Array, Array]:
     """Rows and columns of N and g of what is fitted, priors added."""
-    p, priors, shape = fit.parameters, fit.priors, fit.parameters.shape
-    precision, pull = np.zeros(len(of.g)), np.zeros(len(of.g))
-    if math.isfinite(shape[KAPPA]):
-        precision[KAPPA] = 1.0 / priors.kappa**2
-        pull[KAPPA] = precision[KAPPA] * (priors.kappa - shape[KAPPA])
-    precision[2] = priors.log_radius[1] / shape[2] ** 2
-    pull[2] = precision[2] * shape[2] * (priors.log_radius[0] - math.log(shape[2]))
-    precision[WHITE] = priors.white[1]
-    pull[WHITE] = priors.white[1] * (priors.white[0] - p.white)
-    precision[FIRST_NODE:] = priors.nodes
-    off = -p.nodes
-    off[:, 0] += p.nodes[:, 0].mean()
-    pull[FIRST_NODE:] = priors.nodes * off.ravel()
-    active = active_parameters(unknowns, len(p.nodes))
-    part = of.N[active[:, None], active]
-    part[np.diag_indices(len(active))] += precision[active]
-    return part, (of.g + pull)[active]
+    p, priors = fit.parameters, fit.priors
+    N, g = _with_priors(
+        of.N, of.g, active_parameters(unknowns, len(p.nodes)), p.shape, float(p.white), p.nodes, priors.kappa,
+        priors.log_radius, priors.white, priors.nodes,
+    )  # fmt: skip
+    return N, g
 
 
 def place_of(unknowns: Unknowns, nodes: int, index: Indices) -> Indices:
@@ -122,23 +107,22 @@ def _sector_blocks(image, value, jacobian, first, weight, columns, low, high):  
     return out
 
 
-def _assembled(blocks: Array, share: Array) -> tuple[Array, Array]:
+@njit(cache=True)
+def _assembled(blocks, share):  # type: ignore[no-untyped-def]
     """(N (8 + 3k, 8 + 3k), upper triangle, g): the sum of the sectors' blocks, each times its `share` (k,)."""
-    place, pairs, size = _places(len(blocks))
-    weighted = blocks * share[:, None, None]
-    N = np.bincount(pairs, weighted[:, LOWER[0], LOWER[1]].ravel(), size * size)
-    g = np.bincount(place, weighted[:, LOCAL].ravel(), size)
-    return np.asarray(N, np.float64).reshape(size, size), np.asarray(g, np.float64)
-
-
-@functools.lru_cache(maxsize=8)
-def _places(k: int) -> tuple[Indices, Indices, int]:
-    """(where the sectors' parameters are among all, where the pairs of LOWER are in N, number of all parameters)."""
-    node, size = FIRST_NODE + 3 * np.arange(k)[:, None] + np.arange(3), FIRST_NODE + 3 * k
-    shared = np.tile(np.arange(FIRST_NODE), (k, 1))
-    place = np.concatenate([shared, node, np.roll(node, -1, axis=0)], axis=1)
-    p, q = place[:, LOWER[0]], place[:, LOWER[1]]
-    return place.ravel(), (np.minimum(p, q) * size + np.maximum(p, q)).ravel(), size
+    k = blocks.shape[0]
+    size = FIRST_NODE + 3 * k
+    N, g = np.zeros((size, size)), np.zeros(size)
+    place = np.empty(LOCAL, np.int64)
+    for node in range(k):
+        for p in range(LOCAL):
+            place[p] = _place(p, node, k)
+        for p in range(LOCAL):
+            g[place[p]] += share[node] * blocks[node, LOCAL, p]
+            for q in range(p + 1):
+                i, j = min(place[p], place[q]), max(place[p], place[q])
+                N[i, j] += share[node] * blocks[node, p, q]
+    return N, g
 
 
 @njit(cache=True)
@@ -164,3 +148,33 @@ def _gradient(image, value, jacobian, first, weight, columns, high):  # type: ig
                 total += jacobian[p, i] * (weight[i] * (image[i] - value[i]))
             g[_place(p, node, k)] += total
     return g
+
+
+@njit(cache=True)
+def _with_priors(N, g, active, shape, white, nodes, kappa, log_radius, white_prior, precisions):  # type: ignore[no-untyped-def]
+    """Rows and columns `active` of N (upper triangle) and g, with the fields of Priors added."""
+    precision, pull = np.zeros(g.shape[0]), np.zeros(g.shape[0])
+    if math.isfinite(shape[KAPPA]):
+        precision[KAPPA] = 1.0 / kappa**2
+        pull[KAPPA] = precision[KAPPA] * (kappa - shape[KAPPA])
+    precision[2] = log_radius[1] / shape[2] ** 2
+    pull[2] = precision[2] * shape[2] * (log_radius[0] - math.log(shape[2]))
+    precision[WHITE] = white_prior[1]
+    pull[WHITE] = white_prior[1] * (white_prior[0] - white)
+    level = 0.0
+    for j in range(nodes.shape[0]):
+        level += nodes[j, 0] / nodes.shape[0]
+    for j in range(nodes.shape[0]):
+        for c in range(3):
+            i = FIRST_NODE + 3 * j + c
+            precision[i] = precisions[3 * j + c]
+            pull[i] = precision[i] * ((level if c == 0 else 0.0) - nodes[j, c])
+    n = active.shape[0]
+    part, right = np.zeros((n, n)), np.empty(n)
+    for i in range(n):
+        right[i] = g[active[i]] + pull[active[i]]
+        row = N[active[i]]
+        for j in range(i, n):
+            part[i, j] = row[active[j]]
+        part[i, i] += precision[active[i]]
+    return part, right

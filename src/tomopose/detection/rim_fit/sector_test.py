@@ -18,8 +18,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numba import njit
 
 from tomopose.detection.cholesky import solve
+from tomopose.detection.order_statistics import select
 from tomopose.detection.rim_fit.noise import excess_variance
 from tomopose.detection.rim_fit.normal_equations import Equations, summed, with_priors
 from tomopose.detection.rim_fit.state import RimFit, active_parameters
@@ -59,16 +61,16 @@ def _kept_weight(fit: RimFit, residual: Array, parameters: float) -> Array:
     """(k,) share of its weight that these residuals leave each sector."""
     settings, pixels = fit.settings.sector_test, fit.pixels
     cell = settings.cell * max(fit.ring.blur / fit.settings.ring.sharp, 1.0)
-    return kept_weight(
-        fit.distance, pixels.sector, pixels.share, residual * np.sqrt(fit.weight), fit.ring.nodes,
-        (cell, settings.parts, fit.settings.noise.rare), parameters, fit.noise.sum_variance,
+    return np.asarray(
+        kept_weight(
+            fit.distance, pixels.sector, pixels.share, residual * np.sqrt(fit.weight), fit.ring.nodes,
+            (cell, settings.parts, fit.settings.noise.rare), parameters, fit.noise.sum_variance,
+        )
     )  # fmt: skip
 
 
-def kept_weight(
-    s: Array, sector: Array, share: Array, normalised: Array, k: int, cells: tuple[float, int, float],
-    parameters: float, noise: float,
-) -> Array:  # fmt: skip
+@njit(cache=True)
+def kept_weight(s, sector, share, normalised, k, cells, parameters, noise):  # type: ignore[no-untyped-def]
     """(k,) share of its weight that a sector keeps: 1 over its cells' mean square, where chance does not explain it.
 
     normalised: residuals in standard deviations, 0 for a pixel that is left out.  cells: their height, their number
@@ -76,30 +78,48 @@ def kept_weight(
     most, so that correlated noise is not a sector's fault; no more than `noise`.
     """
     height, parts, rare = cells
-    used = np.flatnonzero((s > 0.0) & (normalised != 0.0))
-    cells_each = (1 + int(s.max(initial=0.0) / height)) * parts
-    cell = (s[used] / height).astype(np.int64) * parts + np.minimum((share[used] * parts).astype(np.int64), parts - 1)
-    place = sector[used] * cells_each + cell
-    total = np.bincount(place, normalised[used], k * cells_each).reshape(k, cells_each)
-    count = np.bincount(place, minlength=k * cells_each).reshape(k, cells_each)
-    several = count > 1
-    freedom = several.sum(axis=1) - parameters
-    square = np.where(several, total**2 / np.maximum(count, 1), 0.0).sum(axis=1) / np.maximum(freedom, 1.0)
-    enough, kept = np.flatnonzero(freedom > 2.0), np.ones(k)
-    if enough.size > 0:
-        usual = min(max(1.0, float(np.partition(square[enough], enough.size // 3)[enough.size // 3])), noise)
-        for j in enough.tolist():
-            kept[j] = 1.0 / excess_variance(float(square[j]) / usual, float(freedom[j]), rare)
+    farthest = 0.0
+    for i in range(s.shape[0]):
+        farthest = max(farthest, s[i])
+    rings = 1 + int(farthest / height)
+    total, count = np.zeros((k, rings * parts)), np.zeros((k, rings * parts))
+    for i in range(s.shape[0]):
+        if s[i] > 0.0 and normalised[i] != 0.0:
+            cell = int(s[i] / height) * parts + min(int(share[i] * parts), parts - 1)
+            total[sector[i], cell] += normalised[i]
+            count[sector[i], cell] += 1.0
+    freedom, square, ordered, kept, m = np.empty(k), np.empty(k), np.empty(k), np.ones(k), 0
+    for j in range(k):
+        freedom[j], square[j] = -parameters, 0.0
+        for cell in range(rings * parts):
+            if count[j, cell] > 1.0:
+                square[j] += total[j, cell] ** 2 / count[j, cell]
+                freedom[j] += 1.0
+        square[j] /= max(freedom[j], 1.0)
+        if freedom[j] > 2.0:
+            ordered[m] = square[j]
+            m += 1
+    if m == 0:
+        return kept
+    usual = min(max(1.0, select(ordered[:m], m // 3)), noise)
+    for j in range(k):
+        if freedom[j] > 2.0:
+            kept[j] = 1.0 / excess_variance(square[j] / usual, freedom[j], rare)
     return kept
 
 
-def model_change(jacobian: Array, sector: Array, step: Array, k: int) -> Array:
+@njit(cache=True)
+def model_change(jacobian, sector, step, k):  # type: ignore[no-untyped-def]
     """(n,) change of the model with a step (8 + 3k,) of all parameters, to first order."""
-    out = np.zeros(len(sector))
-    for p in np.flatnonzero(step[:FIRST_NODE]).tolist():
-        out += jacobian[p] * step[p]
-    nodes = step[FIRST_NODE:].reshape(k, 3)
-    for p in range(3):
-        out += jacobian[FIRST_NODE + p] * nodes[sector, p]
-        out += jacobian[FIRST_NODE + 3 + p] * nodes[(sector + 1) % k, p]
+    out = np.zeros(sector.shape[0])
+    for p in range(FIRST_NODE):
+        if step[p] != 0.0:
+            for i in range(sector.shape[0]):
+                out[i] += jacobian[p, i] * step[p]
+    for i in range(sector.shape[0]):
+        node = sector[i]
+        right = node + 1 if node + 1 < k else 0
+        for p in range(3):
+            out[i] += jacobian[FIRST_NODE + p, i] * step[FIRST_NODE + 3 * node + p]
+            out[i] += jacobian[FIRST_NODE + 3 + p, i] * step[FIRST_NODE + 3 * right + p]
     return out

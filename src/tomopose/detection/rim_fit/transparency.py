@@ -6,7 +6,9 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from numba import njit
 
+from tomopose.detection.order_statistics import median
 from tomopose.detection.rim_fit.state import Parameters, RimFit, Unknowns
 from tomopose.detection.rim_fit.steps import stepped, with_equal_weights
 from tomopose.detection.rim_model.ring import annulus_pixels
@@ -77,7 +79,8 @@ def _from_attenuation(fit: RimFit, start: Array, kappa: float) -> RimFit:
     return fit
 
 
-def _middle_value(values: Array) -> tuple[float, float]:
+@njit(cache=True)
+def _middle_value(values):  # type: ignore[no-untyped-def]
     """Median of the values, and its standard deviation."""
-    middle = float(np.median(values))
-    return middle, 1.8 * float(np.median(np.abs(values - middle))) / math.sqrt(len(values))
+    middle = median(values.copy())
+    return middle, 1.8 * median(np.abs(values - middle)) / math.sqrt(values.shape[0])

@@ -75,38 +75,34 @@ def edge_profile(sigma: float, kappa: float, radius: float, s_low: float, s_high
     return EdgeProfile(make(sigma, kappa, radius, first, n), first * step - inwards, step)
 
 
-def _straight_opaque(sigma: float, kappa: float, radius: float, first: int, n: int) -> Array:
-    inwards, square = sigma**2 / (2.0 * radius), sigma**2
-    i = np.arange(first, first + n)
-    x = i / STEPS_PER_SIGMA
-    s, at = x * sigma - inwards, np.clip(i + len(PHI) // 2, 0, len(PHI) - 1)
-    Phi, phi = PHI[at], PHI_PRIME[at] / sigma
-    return np.column_stack([
-        Phi - PIXEL_CUMULANT / 24.0 * (x * x * x - 3.0 * x) / sigma**3 * phi,
-        phi,
-        -x / sigma * phi,
-        s * Phi + square * phi,
-        0.5 * ((s * s + square) * Phi + (s - inwards) * square * phi),
-    ])  # fmt: skip
-
-
-def _straight_transparent(sigma: float, kappa: float, radius: float, first: int, n: int) -> Array:
-    opaque = _straight_opaque(sigma, kappa, radius, first, n)
-    out = np.zeros((n, COLUMNS))
-    out[:, [0, 1, 2, 4]] = opaque[:, [0, 1, 2, 4]]
-    _add_what_passes_straight(out, sigma, kappa, radius, first)
-    inwards, step = sigma**2 / (2.0 * radius), sigma / STEPS_PER_SIGMA
-    _add_the_rest(out, sigma, radius, first * step - inwards, step)
+@njit(cache=True)
+def _straight_opaque(sigma, kappa, radius, first, n):  # type: ignore[no-untyped-def]
+    out = np.zeros((n, STRAIGHT))
+    inwards = sigma * sigma / (2.0 * radius)
+    middle = PHI.shape[0] // 2
+    for i in range(n):
+        x = (first + i) / STEPS_PER_SIGMA
+        s, at = x * sigma - inwards, min(max(first + i + middle, 0), 2 * middle)
+        Phi, phi = PHI[at], PHI_PRIME[at] / sigma
+        out[i, 0] = Phi - PIXEL_CUMULANT / 24.0 * (x * x * x - 3.0 * x) / sigma**3 * phi
+        out[i, 1] = phi
+        out[i, 2] = -x / sigma * phi
+        out[i, 3] = s * Phi + sigma * sigma * phi
+        out[i, 4] = 0.5 * ((s * s + sigma * sigma) * Phi + (s - inwards) * sigma * sigma * phi)
     return out
 
 
 @njit(cache=True)
-def _add_what_passes_straight(out, sigma, kappa, radius, first):  # type: ignore[no-untyped-def]
+def _straight_transparent(sigma, kappa, radius, first, n):  # type: ignore[no-untyped-def]
     """What passes the ball, summed over depth = q^2 below the rim: so the square root of the chord is smooth."""
+    opaque = _straight_opaque(sigma, kappa, radius, first, n)
+    out = np.zeros((n, COLUMNS))
+    out[:, 4] = opaque[:, 4]
     inwards = sigma * sigma / (2.0 * radius)
-    for i in range(out.shape[0]):
-        s = (first + i) / STEPS_PER_SIGMA * sigma
-        O, O1, O2, by_kappa, slope_by_kappa = out[i, 0], out[i, 1], out[i, 2], 0.0, 0.0
+    for i in range(n):
+        x = (first + i) / STEPS_PER_SIGMA
+        s = x * sigma
+        O, O1, O2, by_kappa, slope_by_kappa = opaque[i, 0], opaque[i, 1], opaque[i, 2], 0.0, 0.0
         low, high = max(0.0, -s - REACH * sigma), min(2.0 * radius, -s + REACH * sigma)
         q_low, q_high = math.sqrt(low), math.sqrt(max(high, low))
         h = (q_high - q_low) / DEPTH_NODES
@@ -124,23 +120,15 @@ def _add_what_passes_straight(out, sigma, kappa, radius, first):  # type: ignore
         out[i, 0], out[i, 1], out[i, 2] = O, O1, O2
         out[i, 7] = by_kappa
         out[i, 8] = (s - inwards) * by_kappa + sigma * sigma * slope_by_kappa
-
-
-def _curved(sigma: float, kappa: float, radius: float, first: int, n: int) -> Array:
-    """The opaque ball in closed form, O by summing O' from far outside; what passes it, summed over radius."""
-    out = np.zeros((n, COLUMNS))
-    step = sigma / COARSE_STEPS_PER_SIGMA
-    _add_opaque(out, sigma, radius, first)
-    if not math.isinf(kappa):
-        _add_what_passes(out, sigma, kappa, radius, first)
-    _add_the_rest(out, sigma, radius, first * step, step)
+    _add_the_rest(out, sigma, radius, first * sigma / STEPS_PER_SIGMA - inwards, sigma / STEPS_PER_SIGMA)
     return out
 
 
 @njit(cache=True)
-def _add_opaque(out, sigma, radius, first):  # type: ignore[no-untyped-def]
-    """Puts O, O', O'' and Q of the opaque ball into their columns."""
-    step, square, n = sigma / COARSE_STEPS_PER_SIGMA, sigma * sigma, out.shape[0]
+def _curved(sigma, kappa, radius, first, n):  # type: ignore[no-untyped-def]
+    """The opaque ball in closed form, O by summing O' from far outside; what passes it, summed over radius."""
+    out = np.zeros((n, COLUMNS))
+    step, square = sigma / COARSE_STEPS_PER_SIGMA, sigma * sigma
     O, before, bend_before = 1.0, 0.0, 0.0
     start = max(first + n - 1, int(REACH * COARSE_STEPS_PER_SIGMA) + 1)
     for at in range(start, first - 1, -1):
@@ -161,6 +149,10 @@ def _add_opaque(out, sigma, radius, first):  # type: ignore[no-untyped-def]
             out[i, 4] = 0.5 * ((s * s + square) * O + 2.0 * square * s * O1 + square * square * O2)
             x = s / sigma + sigma / (2.0 * radius)
             out[i, 0] -= PIXEL_CUMULANT / 24.0 * (x * x * x - 3.0 * x) / sigma**4 * 0.3989423 * math.exp(-0.5 * x * x)
+    if not math.isinf(kappa):
+        _add_what_passes(out, sigma, kappa, radius, first)
+    _add_the_rest(out, sigma, radius, first * step, step)
+    return out
 
 
 @njit(cache=True)
@@ -198,17 +190,21 @@ def _add_what_passes(out, sigma, kappa, radius, first):  # type: ignore[no-untyp
         out[i, 8] = (first + i) * step * out[i, 7] + square * out[i, 8]
 
 
-def _add_the_rest(out: Array, sigma: float, radius: float, first_s: float, step: float) -> None:
+@njit(cache=True)
+def _add_the_rest(out, sigma, radius, first_s, step):  # type: ignore[no-untyped-def]
     """R, R', R'', Q' and -dO/dR from O, O', O'' and Q; second derivatives of R and Q by differences along the table."""
-    square, s = sigma**2, first_s + step * np.arange(len(out))
-    r = np.maximum(radius + s, 0.1 * sigma)
-    O, O1, O2 = out[:, 0], out[:, 1], out[:, 2]
-    out[:, 3] = s * O + square * O1
-    out[:, 5] = O + s * O1 + square * O2
-    out[:, 10] = (r * O1 + square * (O2 + O1 / r)) / radius
-    for column, of in ((6, 5), (9, 4)):
-        out[1:-1, column] = (out[2:, of] - out[:-2, of]) / (2.0 * step)
-        out[0, column], out[-1, column] = out[1, column], out[-2, column]
+    square, n = sigma * sigma, out.shape[0]
+    for i in range(n):
+        s = first_s + i * step
+        r = max(radius + s, 0.1 * sigma)
+        out[i, 3] = s * out[i, 0] + square * out[i, 1]
+        out[i, 5] = out[i, 0] + s * out[i, 1] + square * out[i, 2]
+        out[i, 10] = (r * out[i, 1] + square * (out[i, 2] + out[i, 1] / r)) / radius
+    for i in range(1, n - 1):
+        out[i, 6] = (out[i + 1, 5] - out[i - 1, 5]) / (2.0 * step)
+        out[i, 9] = (out[i + 1, 4] - out[i - 1, 4]) / (2.0 * step)
+    for c in (6, 9):
+        out[0, c], out[n - 1, c] = out[1, c], out[n - 2, c]
 
 
 @njit(cache=True)
