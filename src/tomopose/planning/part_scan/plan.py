@@ -212,10 +212,9 @@ class _Judge:
         shared = None
         if self.setting.calibration is not None:
             x = np.array([t.x.mean(axis=0) for t in goal.targets])
-            found = projection_matrices(
-                self.setting.calibration, self.machine.commanded(q), points=x, home=self.machine.home
-            )
-            sigma = found.points_sigma_shared
+            commanded = self.machine.commanded(q)
+            matrices = projection_matrices(self.setting.calibration, commanded, points=x, home=self.machine.home)
+            sigma = matrices.points_sigma_shared
             assert sigma is not None
             shared = shared_part(goal, self.machine.scanner, P, np.asarray(sigma).reshape(-1, len(x)).mean(axis=0))
         found, lengths = predicted(goal, self.machine.scanner, P, views, plan=self.setting.features, shared=shared)
