@@ -132,6 +132,7 @@ def scan_plan() -> str:
         "paths": {"circle": {**figures, "J": 0.5}}, "unseen": [{"name": "bore", "why": "no ray runs along it"}],
         "transmission_by_view": [0.5] * 30, "limits": {"x_mm": [-10.0, 10.0]}, "assumed_limits": ["x_mm"],
         "constants": {"graze_deg": 3.0}, "attenuation": "Al, 0.05 per mm",
+        "joints": [{"joint": 1, "unit": "deg", "lowest": -31.0, "highest": 28.0, "limits": [-90.0, 90.0]}],
         "freedoms": [{"name": "tilt of 10 degrees", "J": 0.66, "gain": 0.05}],
     }  # fmt: skip
     corners = np.array([[x, y, z] for x in (0.0, 10.0) for y in (0.0, 10.0) for z in (0.0, 10.0)])
