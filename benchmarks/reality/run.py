@@ -27,7 +27,7 @@ NOISE = 0.0146
 PLATFORM_SCALE, ROBOT_SCALE, PLATFORM_ROTATION_SCALE = 5e-5, 1e-3, 1.3e-4
 """Documented defaults for the scale of a manipulator's translations and of a platform's rotations, where nothing is
 stated of the scanner."""
-AXIS_MM, AXIS_RAD = 0.04, 2e-4
+AXIS_MM, AXIS_RAD = 0.02, 2e-4
 """Documented defaults for where the table's axis is."""
 FLOOR = 0.002
 """px: below it a true error is noise of the benchmark, whatever its ratio to the stated one."""

@@ -31,8 +31,7 @@ class Default:
 _DISTANCES = "makers state distances to some tenths of a mm: Ferrucci et al., Meas. Sci. Technol. 26 (2015) 092003"
 _PITCH = "glass expands by 3e-6 to 8e-6 a kelvin, and data sheets print pitches with four digits"
 _HALF_PIXEL = "half a pixel lies between counting from the corner and from the centre of a pixel"
-_AXIS = "the axis defines W; a voxel of the paper's scanner, what a search for the centre of rotation by eye leaves"
-_AXIS_TILT = "the axis defines W; what is left of its alignment after a search for the centre of rotation"
+_AXIS = "the axis defines W; what is left of its alignment after a search for the centre of rotation"
 
 DEFAULTS: Mapping[str, Default] = MappingProxyType(
     {
@@ -45,15 +44,12 @@ DEFAULTS: Mapping[str, Default] = MappingProxyType(
         "eta": Default(sigma=1e-3, source="0.06 degrees, what a machinist's level shows of a panel"),
         "theta": Default(sigma=2e-3, source="0.1 degrees: 0.8 mm over a panel of 400 mm"),
         "phi": Default(sigma=2e-3, source="0.1 degrees: 0.8 mm over a panel of 400 mm"),
-        "axis_y": Default(sigma=0.04, source=_AXIS),
-        "axis_tilt_x": Default(sigma=2e-4, source=_AXIS_TILT),
-        "axis_tilt_y": Default(sigma=2e-4, source=_AXIS_TILT),
+        "axis_y": Default(sigma=0.02, source=_AXIS),
+        "axis_tilt_x": Default(sigma=2e-4, source=_AXIS),
+        "axis_tilt_y": Default(sigma=2e-4, source=_AXIS),
     }
 )
-"""Name -> default of a scanner's value, in the value's own unit.
-
-axis_y is 0.2 mm / 5.3, a voxel of the paper's scanner, and tuned on benchmarks/reality: with 0.02 mm a scan was 7.7
-stated sigmas off where the table had stood still in the calibration."""
+"""Name -> default of a scanner's value, in the value's own unit."""
 
 ROTATION_SCALE, AS_DELIVERED_ROTATION_SCALE = 2e-5, 1.3e-4
 """Scale error of a platform's rotations: that of linear encoders with the geometry of the joints; and of a platform as
