@@ -1,7 +1,7 @@
 """A scan of 360 views of 512^2 px on 256^3 voxels through `tp.refine`: processor time, memory and what is reached.
 
-    python benchmarks/refine/large.py --folder /tmp/large                       # continues after a stop
-    python benchmarks/refine/large.py --folder /tmp/small --views 90 --pixels 256 --voxels 128
+    python benchmarks/refine/large.py --folder large                       # continues after a stop
+    python benchmarks/refine/large.py --folder small --views 90 --pixels 256 --voxels 128
 
 Balls, seven periods of tilt, white scatter of 1 px and 0.4 degrees a view, noise 0.5 %.  Every stage that is done is
 written to FOLDER/log.jsonl with the processor time and the largest memory of the process so far.

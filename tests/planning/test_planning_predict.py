@@ -11,6 +11,7 @@ import pytest
 from scipy.sparse import csr_array
 
 import tomopose as tp
+from tomopose.engines.cpu import CpuEngine
 from tomopose.geometry.box import BOX_CORNERS
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.measurement.mesh.mesh import Mesh
@@ -20,13 +21,13 @@ from tomopose.planning.part import sart_steps as sart_steps_module
 from tomopose.planning.part.part import Part
 from tomopose.planning.part.predict import _lengths, _slopes, predicted
 from tomopose.planning.part.sart_response import RELAXATION, Blocks, blocks, sart_response
-from tomopose.planning.part.sart_steps import SartSteps, sart_steps, weights_on_pixels
+from tomopose.planning.part.sart_steps import SartSteps, relaxed_per_length, sart_steps, weights_on_pixels
 from tomopose.planning.part.settings import PartSettings
 from tomopose.planning.part.targets import probed_targets
 from tomopose.planning.part.worth import table
 from tomopose.planning.part_scan.setting import Setting
+from tomopose.reconstruction import updates
 from tomopose.reconstruction.settings import SART
-from tomopose.reconstruction.updates import SHORTEST_RAY
 
 HALF = np.array([9.0, 7.0, 4.0])
 VIEWS, SWEEPS = 15, 2
@@ -116,7 +117,7 @@ def test_the_steps_of_sart_backwards_are_the_transpose_of_reconstruct(rng):
     )
     scale = float(np.sqrt(np.mean(volume.values**2)))
     for c in (rng.normal(size=box.shape), np.eye(1, box.size, box.size // 3).reshape(box.shape)):
-        g = weights_on_pixels(matrices, box, c, SWEEPS)
+        g = weights_on_pixels(matrices, box, c, SWEEPS, relaxed_per_length(CpuEngine(matrices, box)))
         assert np.vdot(g, p) == pytest.approx(np.vdot(c, volume.values), abs=1e-3 * scale * np.linalg.norm(c))
 
 
@@ -127,7 +128,7 @@ def test_sart_step_by_step_is_reconstruct_and_both_leave_out_the_same_rays():
     how = {"images_are": "line-integrals", "engine": "cpu", "consistency": "off"}
     found = tp.reconstruct(L, steps.matrices, steps.box, algorithm=SART(iterations=SWEEPS), **how)
     np.testing.assert_allclose(steps.coefficients, spline_coefficients(found.values), atol=2e-5)
-    assert sart_steps_module.SHORTEST_RAY == SHORTEST_RAY
+    assert sart_steps_module.per_length is updates.per_length
     x = steps.box.points(np.array([[5, 6, 7], [8, 9, 10]]))
     np.testing.assert_allclose(steps.at(x), [found.values[5, 6, 7], found.values[8, 9, 10]], atol=2e-5)
 

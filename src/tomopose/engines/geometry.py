@@ -33,6 +33,16 @@ def index_geometry(matrices: ProjectionMatrices, grid: VoxelGrid) -> IndexGeomet
     return IndexGeometry(P=P, source=-(M_inv @ P[:, :, 3:])[..., 0], M_inv=np.ascontiguousarray(M_inv))
 
 
+SHORTEST_RAY = 2.0
+"""Rays that cross less than this many voxels of the grid have no say: their residual would be divided by almost 0."""
+
+
+def per_length(lengths: np.ndarray, grid: VoxelGrid) -> np.ndarray:
+    """1/mm: 1 over the lengths of rays in the grid, 0 where a ray is too short, for SART."""
+    with np.errstate(divide="ignore"):
+        return np.where(lengths > SHORTEST_RAY * float(grid.spacing.min()), 1 / lengths, 0)
+
+
 def require_usable(matrices: ProjectionMatrices, grid: VoxelGrid) -> None:
     """OutOfViewError where the grid reaches behind the source or the panel, or no view sees any of it."""
     corners = np.hstack([grid.corners, np.ones((8, 1))])

@@ -352,7 +352,7 @@ class SerialRobot:
                     "theta_offset_deg": float(np.degrees(j.theta_offset)),
                     "kind": j.kind,
                     "sigma": dict(_written(name, ERRORS[name], value) for name, value in j.sigma.items()),
-                    **({} if j.limits is None else {f"limits_{u}": [_written("", u, x)[1] for x in j.limits]}),
+                    **({} if j.limits is None else {f"limits_{u}": [in_unit(x, u) for x in j.limits]}),
                 }
                 for j, u in zip(self.joints, self.joint_units, strict=True)
             ],
@@ -371,9 +371,14 @@ def poses_from_joints(robot: SerialRobot, q: Array, **columns: Any) -> PoseSeque
     return PoseSequence(T_MH=T_MH, q=q, pose_id=tuple(pose_id), **columns)
 
 
+def in_unit(value: float, unit: str) -> float:
+    """A joint's value, mm or rad, as people read it: in mm, or in deg."""
+    return float(value) if unit == "mm" else float(np.degrees(value))
+
+
 def _written(name: str, unit: str, value: float) -> tuple[str, float]:
     """A number of robot.json, its key with the unit: deg for rad."""
-    return (f"{name}_mm", value) if unit == "mm" else (f"{name}_deg", float(np.degrees(value)))
+    return f"{name}_{'mm' if unit == 'mm' else 'deg'}", in_unit(value, unit)
 
 
 def _turn(R: Array) -> Array:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tomopose.engines.geometry import per_length
 from tomopose.reconstruction.checkpoint import Checkpoint
 from tomopose.reconstruction.fdk.filter import FdkFilter
 from tomopose.reconstruction.field import Adding, Field
@@ -22,9 +23,6 @@ from tomopose.reconstruction.line_integrals import LineIntegrals
 
 if TYPE_CHECKING:
     from tomopose.engines.protocol import Engine
-
-SHORTEST_RAY = 2.0
-"""Rays that cross less than this many voxels of the grid have no say: their residual would be divided by almost 0."""
 
 Subset = tuple[int, ...]
 View = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -57,14 +55,11 @@ def stacked(images: Iterable[np.ndarray]) -> np.ndarray:
 
 def sart_update(field: Field, *, relaxation: float, nonnegative: bool) -> Update:
     """One SART step with a subset."""
-    shortest = SHORTEST_RAY * float(field.grid.spacing.min())
 
     def update(subset: Subset, views: list[View]) -> None:
         residual = stacked(p for p, _, _ in views)
         residual -= field.forward(subset)
-        length = field.lengths(subset)
-        with np.errstate(divide="ignore"):
-            residual *= np.where(length > shortest, 1 / length, 0).astype(np.float32)
+        residual *= per_length(field.lengths(subset), field.grid).astype(np.float32)
         for image, (_, bad, fill) in zip(residual, views, strict=True):
             if fill.shape[0]:
                 image[bad] = fill @ np.where(bad, 0, image).ravel()

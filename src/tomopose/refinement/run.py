@@ -155,6 +155,7 @@ def assessed(
     moved = np.sqrt(np.mean(moved_px**2) / np.mean(spread.points_sigma**2))
     known_px = float(np.sqrt(np.mean(spread.points_known**2)))
     halves = halves_px(level, prior, replace(fit, steps=s.steps), K, known_px)
+    misfit = None if balls is None else balls.misfit(state.q)
     verdict, reasons = decide(
         Evidence(
             held_out=held_out,
@@ -164,7 +165,7 @@ def assessed(
             edges=found.edges,
             open_=tuple(each.words for each in open_ if each.left_px > OPEN_PX),
             moved=float(moved),
-            balls=None if balls is None else balls.misfit(state.q),
+            balls=misfit,
         )
     )
     shared = size_sigma(prior.stated, data.matrices.P, points_of(data.grid), centre)
@@ -197,7 +198,7 @@ def assessed(
         halves_px=halves,
         stated_px=float(np.sqrt(np.mean(spread.points_sigma**2))),
         balls=None if balls is None else balls.places(state.q),
-        balls_misfit=float("nan") if balls is None else balls.misfit(state.q),
+        balls_misfit=float("nan") if misfit is None else misfit,
         edge_blur_before_mm=blurs[0],
         edge_blur_after_mm=blurs[1],
         volume_before=volumes[0],

@@ -149,6 +149,24 @@ def add_products(A: Array, B: Array, n: int, N: Array) -> None:
                 N[i, j] += a * A[k, j] + b * B[k, j]
 
 
+@inner
+def take_row(A: Array, B: Array, row: int, where: Any, N: Array) -> int:
+    """Take the products of a row of A and B (TOGETHER, w) into N (m, m), or let it wait; the place of the next row.
+
+    where (w,): the unknowns that the row's columns belong to.  Where these are all unknowns in turn, rows wait until
+    TOGETHER of them are there, and the last ones for `add_products`; else a row is added as it comes, from place 0.
+    """
+    if N.shape[0] == A.shape[1]:
+        if row + 1 < TOGETHER:
+            return row + 1
+        add_products(A, B, TOGETHER, N)
+        return 0
+    for i in range(A.shape[1]):
+        for j in range(i + 1):
+            N[where[i], where[j]] += A[0, i] * A[0, j] + B[0, i] * B[0, j]
+    return 0
+
+
 @njit(cache=True, error_model="numpy")
 def normal_equations(rows: Rows, freed: Freed, at: Array, N: Array, g: Array) -> float:
     """chi2 at a point, and N = J^T J and g = J^T r there (r = observed - calculated, whitened).
@@ -199,15 +217,7 @@ def normal_equations(rows: Rows, freed: Freed, at: Array, N: Array, g: Array) ->
             u, v = A[row, i], B[row, i]
             A[row, i], B[row, i] = w00 * u + w01 * v, w10 * u + w11 * v
             g[where[i]] += A[row, i] * r0 + B[row, i] * r1
-        if m == w:  # every unknown is at its own place
-            row += 1
-            if row == TOGETHER:
-                add_products(A, B, row, N)
-                row = 0
-        else:
-            for i in range(w):
-                for j in range(i + 1):
-                    N[where[i], where[j]] += A[0, i] * A[0, j] + B[0, i] * B[0, j]
+        row = take_row(A, B, row, where, N)
     add_products(A, B, row, N)
     for j in range(n_f):
         delta, i = at[at.shape[0] - n_f + j], free_from + j

@@ -26,7 +26,7 @@ from numba import njit
 
 from tomopose.calibration.model.ball_projection import ProjectionBlocks
 from tomopose.calibration.model.tall import ByBall
-from tomopose.calibration.rigid.kernel import TOGETHER, add_products
+from tomopose.calibration.rigid.kernel import TOGETHER, add_products, take_row
 from tomopose.geometry.rotations import skew
 from tomopose.manipulator.real_poses import Repeatability
 from tomopose.units import Array
@@ -119,15 +119,7 @@ def _minus_2_log_likelihood(
             P[row, i] = J[k, 0, i] * i00
             Q[row, i] = (J[k, 1, i] - l10 * P[row, i]) * i11
             g[where[i]] += P[row, i] * x + Q[row, i] * y
-        if w == m:  # every unknown is at its own place
-            row += 1
-            if row == TOGETHER:
-                add_products(P, Q, row, N)
-                row = 0
-        else:
-            for i in range(w):
-                for j in range(i + 1):
-                    N[where[i], where[j]] += P[0, i] * P[0, j] + Q[0, i] * Q[0, j]
+        row = take_row(P, Q, row, where, N)
     add_products(P, Q, row, N)
     for i in range(m):
         N[i, i] += information[i]

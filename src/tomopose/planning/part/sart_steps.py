@@ -24,6 +24,7 @@ from numba import njit
 from scipy.sparse import csr_array
 
 from tomopose.engines.cpu import CpuEngine, processors
+from tomopose.engines.geometry import per_length
 from tomopose.geometry.box import BOX_CORNERS
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.geometry.scanner import Scanner
@@ -34,9 +35,6 @@ from tomopose.planning.part.settings import PartSettings
 from tomopose.trajectory.view_order import view_order
 from tomopose.units import Array
 from tomopose.volume import VoxelGrid
-
-SHORTEST_RAY = 2.0
-"""Voxels; rays with less of the grid have no say, as in `reconstruct`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,19 +65,19 @@ class SartSteps:
 
     def covariance(self, x: Array, weights: csr_array) -> Array:
         """(f, f) of the sums weights (f, m) of grey levels at x (m, 3), from the noise of the views."""
-        index = self._index(x)
+        index, per_mm = self._index(x), relaxed_per_length(CpuEngine(self.matrices, self.box))
+
+        def on_pixels(f: int) -> Array:
+            row, c = weights[[f]], np.zeros(self.box.shape)
+            _on_voxels(row.indices, row.data, index, c)
+            # the splines' filter is its own transpose but for its mirrored ends
+            return weights_on_pixels(self.matrices, self.box, spline_coefficients(c), self.sweeps, per_mm).ravel()
+
         with ThreadPoolExecutor(processors()) as pool:
-            g = np.stack(list(pool.map(lambda f: self._on_pixels(weights[[f]], index), range(weights.shape[0]))))
+            g = np.stack(list(pool.map(on_pixels, range(weights.shape[0]))))
         g *= np.sqrt(self.variance).ravel()
         covariance: Array = g @ g.T
         return covariance
-
-    def _on_pixels(self, row: csr_array, index: Array) -> Array:
-        """(n n_v n_u,): the weights of one sum on the line integrals."""
-        c = np.zeros(self.box.shape)
-        _on_voxels(row.indices, row.data, index, c)
-        # the splines' filter is its own transpose but for its mirrored ends
-        return weights_on_pixels(self.matrices, self.box, spline_coefficients(c), self.sweeps).ravel()
 
 
 def sart_steps(part: Part, scanner: Scanner, P: Array, settings: PartSettings) -> SartSteps:
@@ -103,27 +101,26 @@ def sart_steps(part: Part, scanner: Scanner, P: Array, settings: PartSettings) -
     )
 
 
-def _per_mm(engine: CpuEngine, box: VoxelGrid, j: int) -> Array:
-    """(n_v, n_u) w / L of view j; 0 where the ray has too little of the grid."""
-    L = engine.lengths([j])[0].astype(np.float64)
-    shortest = SHORTEST_RAY * float(box.spacing.min())
-    per_mm: Array = np.where(shortest < L, RELAXATION / np.maximum(L, shortest), 0.0)
-    return per_mm
+def relaxed_per_length(engine: CpuEngine) -> Array:
+    """(n, n_v, n_u) w / L; 0 where the ray has too little of the grid."""
+    L = engine.lengths(range(len(engine.matrices))).astype(np.float64)
+    return np.asarray(RELAXATION * per_length(L, engine.grid))
 
 
 def _volume(matrices: ProjectionMatrices, box: VoxelGrid, p: Array, sweeps: int) -> np.ndarray:
     """[z, y, x] 1/mm, that SART makes of line integrals p (n, n_v, n_u)."""
     engine = CpuEngine(matrices, box)
-    state = engine.empty()
+    state, per_mm = engine.empty(), relaxed_per_length(engine)
     for _ in range(sweeps):
         for j in (int(j) for j in view_order(len(p))):
-            residual = (p[j] - engine.forward(state, [j])[0]) * _per_mm(engine, box, j)
+            residual = (p[j] - engine.forward(state, [j])[0]) * per_mm[j]
             engine.back(residual[None].astype(np.float32), [j], into=state, weight="mean")
     return engine.values(state)
 
 
-def weights_on_pixels(matrices: ProjectionMatrices, box: VoxelGrid, c: np.ndarray, sweeps: int) -> Array:
-    """(n, n_v, n_u): of the sum c [z, y, x] of the voxels that SART makes, on the line integrals."""
+def weights_on_pixels(matrices: ProjectionMatrices, box: VoxelGrid, c: np.ndarray, sweeps: int, per_mm: Array) -> Array:
+    """(n, n_v, n_u): of the sum c [z, y, x] of the voxels that SART makes, on the line integrals; per_mm: as of
+    `relaxed_per_length`."""
     engine, n = CpuEngine(matrices, box, threads=1), len(matrices.P)
     y = np.ascontiguousarray(c.T, dtype=np.float64)
     g = np.zeros((n, matrices.n_v, matrices.n_u))
@@ -131,7 +128,7 @@ def weights_on_pixels(matrices: ProjectionMatrices, box: VoxelGrid, c: np.ndarra
         for j in (int(j) for j in view_order(n)[::-1]):
             image = np.zeros(g.shape[1:])
             _transposed_look_up(matrices.P[j], box.origin, box.spacing, y, image)
-            image *= _per_mm(engine, box, j)
+            image *= per_mm[j]
             g[j] += image
             y -= engine.values(engine.transpose(image[None].astype(np.float32), [j])).T
     return g

@@ -22,7 +22,7 @@ from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.rotations import exp_rotation, log_rotation
 from tomopose.geometry.transforms import RigidTransform
-from tomopose.manipulator.serial import SerialRobot
+from tomopose.manipulator.serial import SerialRobot, in_unit
 from tomopose.units import Array
 
 FOLLOWED = 0.5
@@ -112,28 +112,25 @@ class RobotAtWork:
             return f"the robot's arm does not get to any of {len(R)} poses about its working pose"
         beyond = self.beyond(q[arrived])
         k = int((beyond > TOLERANCE).sum(axis=0).argmax())
-        joint, values = self.robot.joints[k], q[arrived, k]
-        unit, scale = ("deg", 180 / np.pi) if joint.kind == "turning" else ("mm", 1.0)
-        low, high = self.limits[:, k] * scale
+        values, unit = q[arrived, k], self.robot.joint_units[k]
+        first, last, low, high = (in_unit(x, unit) for x in (values.min(), values.max(), *self.limits[:, k]))
         return (
             f"joint {k + 1} leaves its stroke in {int((beyond[:, k] > TOLERANCE).sum())} of {len(R)} poses: it would "
-            f"go from {values.min() * scale:.4g} to {values.max() * scale:.4g} {unit} and may from {low:.4g} to "
-            f"{high:.4g} {unit}"
+            f"go from {first:.4g} to {last:.4g} {unit} and may from {low:.4g} to {high:.4g} {unit}"
         )
 
 
 def require_limits(robot: SerialRobot) -> None:
     """InputError where the stroke of a joint is not known, or the working pose is outside of one."""
-    for k, (joint, q) in enumerate(zip(robot.joints, robot.q_start, strict=True)):
-        unit, scale = ("deg", 180 / np.pi) if joint.kind == "turning" else ("mm", 1.0)
+    for k, (joint, q, unit) in enumerate(zip(robot.joints, robot.q_start, robot.joint_units, strict=True)):
         if joint.limits is None:
             raise InputError(
                 f"joint {k + 1} of the robot has no limits_{unit}; without it nobody knows its stroke: add the lowest "
                 "and the highest value that the controller allows"
             )
         if not joint.limits[0] <= q <= joint.limits[1]:
-            low, high = (x * scale for x in joint.limits)
+            here, low, high = (in_unit(x, unit) for x in (q, *joint.limits))
             raise InputError(
-                f"joint {k + 1} of the robot is at {q * scale:.4g} {unit} in its working pose (q_start_deg) and may "
+                f"joint {k + 1} of the robot is at {here:.4g} {unit} in its working pose (q_start_deg) and may "
                 f"go from {low:.4g} to {high:.4g} {unit}"
             )

@@ -7,6 +7,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from tomopose.manipulator.serial import in_unit
 from tomopose.planning.part.settings import LIFT_MM, PLANES, WEIGHTS, PartSettings
 from tomopose.planning.part_scan.plan import Judged, PartScanPlan
 from tomopose.planning.part_scan.robot_at_work import RobotAtWork
@@ -74,10 +75,7 @@ def _joints(plan: PartScanPlan) -> list[Content] | None:
         return None
     out: list[Content] = []
     for k, (unit, q) in enumerate(zip(plan.machine.joint_units, plan.poses.q.T, strict=True)):
-        low, high, *limits = (
-            float(np.degrees(x)) if unit == "deg" else float(x)
-            for x in (q.min(), q.max(), *plan.machine.manipulator.limits[:, k])
-        )
+        low, high, *limits = (in_unit(x, unit) for x in (q.min(), q.max(), *plan.machine.manipulator.limits[:, k]))
         out.append({"joint": k + 1, "unit": unit, "lowest": low, "highest": high, "limits": limits})
     return out
 

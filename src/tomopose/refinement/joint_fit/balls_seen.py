@@ -31,6 +31,7 @@ def balls_of(observations: Sequence[BallObservations], matrices: ProjectionMatri
     n, k = len(matrices), len(observations)
     row = {name: j for j, name in enumerate(matrices.pose_id)}
     z, root, radius = np.zeros((n, k, 2)), np.zeros((n, k, 2, 2)), np.zeros(k)
+    views = []
     for ball, seen in enumerate(observations):
         strange = [name for name in seen.pose_id if name not in row]
         if strange:
@@ -39,14 +40,14 @@ def balls_of(observations: Sequence[BallObservations], matrices: ProjectionMatri
                 "matrices; each ball needs a table whose pose ids are those of the matrices"
             )
         at = np.array([row[name] for name, good in zip(seen.pose_id, seen.seen, strict=True) if good], dtype=np.intp)
+        views.append(at)
         if len(at) < FEWEST_VIEWS:
             raise InputError(f"ball {ball + 1} is seen in {len(at)} views; at least {FEWEST_VIEWS} are needed")
         z[at, ball] = seen.x_D[seen.seen]
         root[at, ball] = np.linalg.cholesky(np.linalg.inv(seen.covariance[seen.seen])).transpose(0, 2, 1)
     balls = Balls(P=matrices.P, centre=centre, z=z, root=root, radius_mm=radius)
     per_mm = magnification(balls, balls.places(np.zeros((n, 6))))
-    for ball, seen in enumerate(observations):
-        at = np.array([row[name] for name, good in zip(seen.pose_id, seen.seen, strict=True) if good], dtype=np.intp)
+    for ball, (seen, at) in enumerate(zip(observations, views, strict=True)):
         if seen.ball_diameter is not None:
             radius[ball] = seen.ball_diameter / 2
         elif seen.semi_major is not None and np.isfinite(seen.semi_major[seen.seen]).any():
