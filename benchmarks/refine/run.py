@@ -30,6 +30,7 @@ from tomopose.refinement.estimate import Steps, estimate
 from tomopose.refinement.halves import matched_to
 from tomopose.refinement.joint_fit.fit import Fit, blank
 from tomopose.refinement.joint_fit.measured import measured
+from tomopose.refinement.joint_fit.projector import Workers
 from tomopose.refinement.joint_fit.pyramid import level_of
 from tomopose.refinement.prior import Prior, with_shared_errors
 from tomopose.refinement.stated import prior_of
@@ -174,13 +175,13 @@ def alternation(case: Case, rounds: int = 10) -> dict[str, object]:
     matrices, grid, s = matrices_of(P, panel), tp.VoxelGrid.cube(n=72, spacing=case.voxel), tp.RefineSettings()
     data = measured(line_integrals_of(images, matrices, "transmission", None), grid, held_out=s.held_out, seed=0)
     prior, _ = prior_of(matrices, grid, s, None)
-    level, threads = level_of(data, 2), processors()
+    level, workers = level_of(data, 2), Workers(threads=processors())
     state, errors = blank(level), []
     for _ in range(rounds):
-        state = Fit(precision=None, steps=1, turns=s.turns, threads=threads)(level, state)
-        state = matched_to(level, state, prior.precision, threads)
+        state = Fit(precision=None, steps=1, turns=s.turns, workers=workers)(level, state)
+        state = matched_to(level, state, prior.precision, workers)
         errors.append(objects.error_px(objects.moved(P, state.q), truth))
-    joint = estimate(data, (2,), prior, s, threads, Steps(2, None))
+    joint = estimate(data, (2,), prior, s, workers, Steps(2, None))
     return {
         "name": f"{case.name}: alternation beside",
         "before": objects.error_px(P, truth),

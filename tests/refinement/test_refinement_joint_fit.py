@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import tomopose as tp
-from tomopose.engines.cpu import CpuEngine
+from tomopose.errors import EngineError
 from tomopose.refinement.estimate import judged_at, levels_of
 from tomopose.refinement.joint_fit.linear import Linear
 from tomopose.refinement.joint_fit.measured import Measured
 from tomopose.refinement.joint_fit.motions import pixel_jacobian
 from tomopose.refinement.joint_fit.precondition import passed_frequencies
+from tomopose.refinement.joint_fit.projector import PIECE, Projector, Workers
 from tomopose.refinement.joint_fit.pyramid import SHARPEST, px_per_mm, smoothed
 from tomopose.refinement.prior import scatter
 from tomopose.refinement.run import jumps
@@ -66,23 +67,57 @@ def test_a_held_out_pixel_that_is_mixed_with_others_judges_no_longer():
 
 def test_preconditioned_turns_come_nearer_to_the_solution_than_as_many_plain_ones():
     m = matrices()
-    engine = CpuEngine(m, GRID, threads=1)
+    projector = Workers(threads=1).projector(m, GRID)
     rng = np.random.default_rng(0)
-    free = np.zeros(engine.empty().shape, dtype=bool)
+    free = np.zeros([k + 3 for k in (25, 24, 23)], dtype=bool)
     free[1:-2, 1:-2, 1:-2] = True
     truth = np.where(free, rng.standard_normal(free.shape), 0).astype(np.float32)
     n = len(m)
-    lines = engine.forward(truth, range(n)).transpose(0, 2, 1).reshape(n, -1)
+    lines = projector.project(truth)
     J, w = np.ones((n, 1, lines.shape[1]), dtype=np.float32), np.ones_like(lines)
 
     def left(turns, H):
-        linear = Linear.of(engine, free, J, w, 1e6 * np.eye(n), 1.0, H)
+        linear = Linear.of(projector, free, J, w, 1e6 * np.eye(n), 1.0, H)
         return linear.solve(lines, np.zeros(n), np.zeros_like(truth), turns=turns, tolerance=0)[0]
 
     best = left(200, None)
     H = passed_frequencies(m, GRID)
     plain, eased = (np.linalg.norm(left(6, each) - best) for each in (None, H))
     assert eased < 0.7 * plain
+
+
+def test_a_cluster_projects_in_pieces_to_the_bytes_that_this_machine_has():
+    distributed = pytest.importorskip("distributed")
+    n = 2 * PIECE + 5
+    m, rng = matrices(n), np.random.default_rng(3)
+    volume = rng.random(GRID.shape).astype(np.float32)
+    y = rng.standard_normal((n, 47 * 43)).astype(np.float32)
+
+    def answers(projector: Projector):
+        x = projector.put(volume)
+        return projector.project(x), *projector.with_derivatives(x), projector.back(y)
+
+    here = answers(Workers(threads=2).projector(m, GRID))
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=":0") as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        there = answers(Workers(threads=1, client=client).projector(m, GRID))
+    for own, other in zip(here, there, strict=True):
+        np.testing.assert_array_equal(other, own)
+    # the adjoint of a projection: <A x, y> = <x, A' y>
+    x = Workers(threads=1).projector(m, GRID).put(volume)
+    assert np.vdot(here[0].astype(float), y) == pytest.approx(np.vdot(x.astype(float), here[3]), rel=1e-4)
+
+
+def test_a_cluster_without_workers_is_an_error():
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as cluster,
+        distributed.Client(cluster) as client,
+        pytest.raises(EngineError, match="no workers"),
+    ):
+        Workers(threads=1, client=client).projector(matrices(), GRID).back(np.zeros((12, 47 * 43), np.float32))
 
 
 def test_levels_that_do_not_fit_the_memory_or_the_work_are_left_out():

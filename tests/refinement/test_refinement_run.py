@@ -119,6 +119,25 @@ def test_a_killed_refinement_continues_after_its_last_level_to_the_same_numbers(
     assert not (tmp_path / "kept").exists()
 
 
+@pytest.mark.slow
+def test_the_workers_of_a_cluster_refine_to_the_same_bytes():
+    distributed = pytest.importorskip("distributed")
+    images, matrices, _ = scan("white")
+    asked = {"levels": (2, 1), "steps": 2, "samples": 4}
+    here = tp.refine(images, matrices, GRID, images_are="transmission", settings=tp.RefineSettings(threads=2, **asked))
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=":0") as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        there = tp.refine(
+            images, matrices, GRID, images_are="transmission", settings=tp.RefineSettings(client=client, **asked)
+        )
+    for name in ("corrections", "sigma", "residual_after"):
+        np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
+    np.testing.assert_array_equal(np.asarray(there.matrices), np.asarray(here.matrices))
+    np.testing.assert_array_equal(there.volume.values, here.volume.values)
+
+
 def test_poses_of_another_number_are_refused():
     images, matrices, _ = scan("none")
     with pytest.raises(tp.TomoposeError, match="8 poses for 24 matrices"):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tomopose.cli.common import NOT_TRUSTWORTHY, OK, arguments
+from tomopose.cli.common import NOT_TRUSTWORTHY, OK, DaskOption, arguments
 from tomopose.cli.options import WritingOptions, add_command
 from tomopose.cli.reconstruct import CorrectedImages, KeptOptions, ScanAndGrid, correction_from, grid_from
 
@@ -55,6 +55,7 @@ class Options(ScanAndGrid, CorrectedImages, KeptOptions, WritingOptions):
     ] = None
     seed: Annotated[int, typer.Option("--seed", help="Random seed of the held-out blocks and the draws.")] = 0
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processors to use; all unless given.")] = None
+    dask: DaskOption = None
 
 
 def refine(options: Options) -> int:
@@ -65,7 +66,7 @@ def refine(options: Options) -> int:
     beyond the grid, a symmetric part) the exit code is 3 and the report names the direction.
     """
     import tomopose as tp
-    from tomopose.cli.job import image_source, open_for
+    from tomopose.cli.job import executor_of, image_source, open_for
     from tomopose.files import require_absent
     from tomopose.provenance import provenance
 
@@ -82,8 +83,7 @@ def refine(options: Options) -> int:
         say, image_source(o.images), known, None, dark=o.dark, flat=o.flat, dataset=o.dataset, rows=o.rows, raw=o.raw
     )
     correction = correction_from(o, stack.rows)
-    settings = tp.RefineSettings(sigma_px=o.sigma, seed=o.seed, threads=o.workers, memory_gib=o.memory)
-    with say.progress("refining") as progress:
+    with say.progress("refining") as progress, executor_of(o.dask) as client:
         result = tp.refine(
             stack,
             P,
@@ -92,7 +92,9 @@ def refine(options: Options) -> int:
             poses=poses,
             balls=balls,
             correction=correction,
-            settings=settings,
+            settings=tp.RefineSettings(
+                sigma_px=o.sigma, seed=o.seed, threads=o.workers, memory_gib=o.memory, client=client
+            ),
             checkpoint=o.checkpoint,
             progress=progress,
         )

@@ -53,7 +53,7 @@ def checkpoint_of(
         detector={"n_u": m.n_u, "n_v": m.n_v, "p_u": m.p_u, "p_v": m.p_v},
         grid={"shape": grid.shape, "spacing": grid.spacing, "centre": grid.centre},
         prior=prior.covariance,
-        settings=replace(settings, threads=None, memory_gib=None),
+        settings=replace(settings, threads=None, memory_gib=None, client=None),
         levels=levels,
         balls=None if balls is None else {"z": balls.z, "root": balls.root, "radius_mm": balls.radius_mm},
     )

@@ -14,6 +14,7 @@ from tomopose.refinement.joint_fit.balls import Balls
 from tomopose.refinement.joint_fit.fit import Fit, State, blank
 from tomopose.refinement.joint_fit.measured import Measured, crossed_edges, crossed_faces, rays_through
 from tomopose.refinement.joint_fit.motions import pixel_jacobian
+from tomopose.refinement.joint_fit.projector import Workers
 from tomopose.refinement.joint_fit.pyramid import binned, finer, level_of
 from tomopose.refinement.prior import Prior
 from tomopose.refinement.settings import IMAGE_COPIES, LEAST_PIXELS, MOST_SAMPLES, VOLUME_COPIES, RefineSettings
@@ -67,7 +68,7 @@ def estimate(
     factors: tuple[int, ...],
     prior: Prior,
     s: RefineSettings,
-    threads: int,
+    workers: Workers,
     steps: Steps,
     checkpoint: Checkpoint | None = None,
     balls: Balls | None = None,
@@ -77,7 +78,7 @@ def estimate(
     K = pixel_jacobian(data.matrices.P, points_of(data.grid), np.asarray(data.grid.centre))
     reached = None if checkpoint is None else checkpoint.resume(prior)
     while reached is None or not (reached.levels == len(factors) or said_already(reached, edges, K)):
-        reached = next_level(data, factors, prior, s, threads, steps, reached, balls)
+        reached = next_level(data, factors, prior, s, workers, steps, reached, balls)
         if checkpoint is not None:
             checkpoint.keep(reached)
     return Estimate(
@@ -108,13 +109,13 @@ def next_level(
     factors: tuple[int, ...],
     prior: Prior,
     s: RefineSettings,
-    threads: int,
+    workers: Workers,
     steps: Steps,
     reached: Reached | None,
     balls: Balls | None = None,
 ) -> Reached:
     """The first level, from nothing, or the one after what was reached."""
-    held = Fit(precision=None, steps=1, turns=s.turns, threads=threads)
+    held = Fit(precision=None, steps=1, turns=s.turns, workers=workers)
     if reached is None:
         level = level_of(data, factors[0])
         state = held(level, blank(level))
@@ -122,7 +123,7 @@ def next_level(
         if faces:
             level = without_rays(level, faces)
             state = blank(level)
-        fit = Fit(precision=prior.precision, steps=s.steps, turns=s.turns, threads=threads, balls=balls)
+        fit = Fit(precision=prior.precision, steps=s.steps, turns=s.turns, workers=workers, balls=balls)
         state = fit(level, state)
         prior = by_evidence(prior, state, balls, most=np.inf)
         steps.done()
@@ -133,7 +134,7 @@ def next_level(
         # the volume first: poses would follow what a coarse one lacks
         state = held(level, replace(reached.state, volume=finer(reached.state.volume, coarse, level.grid)))
     later = max(1, s.steps // 2)
-    fit = Fit(precision=prior.precision, steps=later, turns=s.turns, threads=threads, balls=balls)
+    fit = Fit(precision=prior.precision, steps=later, turns=s.turns, workers=workers, balls=balls)
     state = fit(level, state)
     steps.done()
     levels = 1 if reached is None else reached.levels + 1

@@ -19,6 +19,7 @@ from tomopose.refinement.joint_fit.fit import Fit, State, blank, linearised
 from tomopose.refinement.joint_fit.linear import normal_blocks
 from tomopose.refinement.joint_fit.measured import Measured
 from tomopose.refinement.joint_fit.motions import composed, gauge, motions_of, pixel_jacobian, transforms, without_gauge
+from tomopose.refinement.joint_fit.projector import Workers
 from tomopose.refinement.prior import Prior
 from tomopose.units import Array
 
@@ -53,7 +54,7 @@ def differences(data: Measured, prior: Prior, fit: Fit, K: Array) -> float:
     squares, count = 0.0, 0
     for own, other in ((0, 1), (1, 0)):
         part, state = parts[own], found[own]
-        matched = matched_to(part, replace(state, volume=found[other].volume), precisions[own], fit.threads)
+        matched = matched_to(part, replace(state, volume=found[other].volume), precisions[own], fit.workers)
         moved = np.einsum("nmic,nc->nmi", K[rows[own]], difference(part, matched.q, state.q))
         squares, count = squares + float(np.sum(moved**2)), count + moved.size
     return squares / count
@@ -66,12 +67,12 @@ def views_of(data: Measured, rows: npt.NDArray[np.int_]) -> Measured:
     )
 
 
-def matched_to(data: Measured, state: State, precision: Array, threads: int) -> State:
+def matched_to(data: Measured, state: State, precision: Array, workers: Workers) -> State:
     """The motions and levels of views matched to a volume that is held as it is."""
     centre = np.asarray(data.grid.centre)
     prior = np.stack([precision[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] for j in range(len(data.p))])
     for _ in range(MATCHES):
-        here = linearised(data, state, threads=threads)
+        here = linearised(data, state, workers=workers)
         w = here.weighed(data)
         M = normal_blocks(here.J, w)
         right = np.einsum("ndp,np->nd", here.J, w * here.r).astype(np.float64)

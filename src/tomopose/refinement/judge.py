@@ -7,9 +7,9 @@ from enum import Enum
 
 import numpy as np
 
-from tomopose.engines.cpu import CpuEngine
-from tomopose.refinement.joint_fit.fit import Fit, State, blank, lines_of, matrices_of, residual_of
+from tomopose.refinement.joint_fit.fit import Fit, State, blank, matrices_of, residual_of
 from tomopose.refinement.joint_fit.measured import Measured
+from tomopose.refinement.joint_fit.projector import Workers
 from tomopose.refinement.settings import MISFIT, MISFIT_SHARE, OWN_SIGMA, SIGNIFICANCE
 from tomopose.units import Array, Floats
 
@@ -52,7 +52,7 @@ def trial(data: Measured, refined: State, fit: Fit) -> tuple[Trial, State, State
     states, squares, residuals = [], [], []
     for q in (np.zeros_like(refined.q), refined.q):
         state = volume_only(data, replace(blank(data), q=q))
-        r = residual(data, state, threads=fit.threads)
+        r = residual(data, state, workers=fit.workers)
         squares.append(np.einsum("np,np,np->n", data.judge, r, r, dtype=np.float64))
         size = np.sqrt(np.einsum("np,np->n", data.p, data.p, dtype=np.float64))
         residuals.append(np.sqrt(np.einsum("np,np->n", r, r, dtype=np.float64)) / np.maximum(size, 1e-30))
@@ -77,11 +77,10 @@ def trial(data: Measured, refined: State, fit: Fit) -> tuple[Trial, State, State
     )
 
 
-def residual(data: Measured, state: State, *, threads: int) -> Floats:
+def residual(data: Measured, state: State, *, workers: Workers) -> Floats:
     """Measured minus projected line integrals (n, N)."""
-    engine = CpuEngine(matrices_of(data, state.q), data.grid, threads=threads)
-    lines = lines_of(engine, engine.put(state.volume), len(data.p))
-    return residual_of(data, lines, state.offset)
+    projector = workers.projector(matrices_of(data, state.q), data.grid)
+    return residual_of(data, projector.project(projector.put(state.volume)), state.offset)
 
 
 @dataclass(frozen=True, kw_only=True)

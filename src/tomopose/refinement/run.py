@@ -28,6 +28,7 @@ from tomopose.refinement.joint_fit.fit import Fit, linearised
 from tomopose.refinement.joint_fit.linear import normal_blocks
 from tomopose.refinement.joint_fit.measured import measured, rays_through
 from tomopose.refinement.joint_fit.motions import transforms
+from tomopose.refinement.joint_fit.projector import Workers
 from tomopose.refinement.joint_fit.pyramid import level_of
 from tomopose.refinement.judge import Evidence, Verdict, decide, trial
 from tomopose.refinement.result import Refinement
@@ -108,7 +109,7 @@ def refine(
     scan = line_integrals_of(images, matrices, images_are, correction)
     require_contrast(scan, sorted({0, len(scan) // 3, len(scan) // 2, len(scan) - 1}))
     data = measured(scan, grid, held_out=s.held_out, seed=s.seed)
-    threads = s.threads or processors()
+    workers = Workers(threads=s.threads or processors(), client=s.client)
     points = balls_of(balls, matrices, np.asarray(grid.centre)) if balls else None
     if points is not None:
         data = without_shadows(data, points)
@@ -116,8 +117,8 @@ def refine(
     factors = levels_of(data, s)
     steps = Steps(2 * len(factors) + 4, progress)
     kept = checkpoint_of(checkpoint, scan, grid, prior, s, factors, points)
-    found = estimate(data, factors, prior, s, threads, steps, kept, points)
-    result = assessed(found, matrices, s, threads, steps, points)
+    found = estimate(data, factors, prior, s, workers, steps, kept, points)
+    result = assessed(found, matrices, s, workers, steps, points)
     steps.finish()
     if kept is not None:
         kept.remove()
@@ -129,7 +130,7 @@ def assessed(
     found: Estimate,
     matrices: ProjectionMatrices,
     s: RefineSettings,
-    threads: int,
+    workers: Workers,
     steps: Steps,
     balls: Balls | None = None,
 ) -> Refinement:
@@ -137,11 +138,11 @@ def assessed(
     data, state, prior, K = found.data, found.state, found.prior, found.K
     centre, radius = np.asarray(data.grid.centre), radius_of(data.grid)
     level = level_of(data, found.judged)
-    fit = Fit(precision=prior.precision, steps=3, turns=s.turns, threads=threads)
+    fit = Fit(precision=prior.precision, steps=3, turns=s.turns, workers=workers)
     held_out, before, after = trial(level, state, fit)
     steps.done()
     at = replace(after, q=state.q)
-    here = linearised(level, at, threads=threads)
+    here = linearised(level, at, workers=workers)
     information = normal_blocks(here.motions, here.weighed(level))
     left = 1.0 - float(rays_through(level, found.faces).mean()) if found.faces else 1.0
     finest = information if state.information is None else state.information

@@ -64,6 +64,7 @@ class RefineSettings:
     sigma_px:  prior standard uncertainty of a view where nothing states one; None: what the matrices state, else 1 px.
     samples:   draws of noise from which the uncertainty with the volume unknown is estimated.
     threads:   processors to use; None for all.
+    client:    a dask.distributed client: its workers take the projections, with the same bytes.
     seed:      of the held-out blocks and the draws.
     memory_gib: memory to keep within, by leaving out levels that are too fine for it; what is free unless given.
     """
@@ -75,6 +76,7 @@ class RefineSettings:
     sigma_px: float | None = None
     samples: int = 4
     threads: int | None = None
+    client: object | None = None
     seed: int = 0
     memory_gib: float | None = None
 

@@ -63,7 +63,7 @@ def drawn_errors(
     precision = with_levels(own)
     H = passed_frequencies(data.matrices, data.grid)
     system, _ = with_balls(precision, np.zeros(7 * n), balls, state.q)
-    linear = Linear.of(here.engine, x > 0, here.J, w, system, ridge_of(state.volume, state.chi), H)
+    linear = Linear.of(here.projector, x > 0, here.J, w, system, ridge_of(state.volume, state.chi), H)
     rng, root = np.random.default_rng([seed, 21]), root_of(C)
     root_of_balls = None if balls is None else root_of(balls.reduced(state.q)[0])
     G = gauge(data.matrices.P, np.asarray(data.grid.centre))

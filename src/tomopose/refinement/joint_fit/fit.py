@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from tomopose.engines.cpu import CpuEngine
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.refinement.joint_fit.balls import Balls
-from tomopose.refinement.joint_fit.derivatives import integrals_with_derivatives
 from tomopose.refinement.joint_fit.linear import Linear, normal_blocks
 from tomopose.refinement.joint_fit.measured import Measured
 from tomopose.refinement.joint_fit.motions import composed, gauge, transforms, without_gauge
 from tomopose.refinement.joint_fit.precondition import passed_frequencies
+from tomopose.refinement.joint_fit.projector import Projector, Workers
 from tomopose.units import Array, Floats
 
 LEVEL_SIGMA = 0.01
@@ -52,11 +51,6 @@ def matrices_of(data: Measured, q: Array) -> ProjectionMatrices:
     return ProjectionMatrices(P=P, n_u=m.n_u, n_v=m.n_v, p_u=m.p_u, p_v=m.p_v, pose_id=m.pose_id, in_front=m.in_front)
 
 
-def lines_of(engine: CpuEngine, state: np.ndarray, n: int) -> Floats:
-    """Line integrals (n, N), pixels as [u, v]."""
-    return np.asarray(engine.forward(state, range(n)).transpose(0, 2, 1)).reshape(n, -1)
-
-
 def residual_of(data: Measured, lines: Floats, offset: Array) -> Floats:
     """Measured minus projected line integrals (n, N), the images' levels taken off, float32."""
     return data.p - lines - offset[:, None].astype(np.float32)
@@ -66,11 +60,11 @@ def residual_of(data: Measured, lines: Floats, offset: Array) -> Floats:
 class Linearised:
     """A level's data at a state.
 
-    engine: of its matrices;  x: its volume as the engine holds it;  J: (n, 7, N) derivatives by each view's motion and
-    level, (n, 1, N) with the motions held;  r: (n, N) residual.
+    projector: of its matrices;  x: its volume as the projector holds it;  J: (n, 7, N) derivatives by each view's
+    motion and level, (n, 1, N) with the motions held;  r: (n, N) residual.
     """
 
-    engine: CpuEngine
+    projector: Projector
     x: np.ndarray
     J: Floats
     r: Floats
@@ -85,19 +79,17 @@ class Linearised:
         return robust_weights(self.r, data, first=False)[0]
 
 
-def linearised(data: Measured, state: State, *, threads: int, held: bool = False) -> Linearised:
+def linearised(data: Measured, state: State, *, workers: Workers, held: bool = False) -> Linearised:
     """The data's residual and derivatives at a state; held: by the images' levels alone."""
-    n, matrices = len(data.p), matrices_of(data, state.q)
-    engine = CpuEngine(matrices, data.grid, threads=threads)
-    x = engine.put(state.volume)
-    ones = np.ones((n, 1, data.p.shape[1]), dtype=np.float32)
+    projector = workers.projector(matrices_of(data, state.q), data.grid)
+    x = projector.put(state.volume)
+    ones = np.ones((len(data.p), 1, data.p.shape[1]), dtype=np.float32)
     if held:
-        lines, J = lines_of(engine, x, n), ones
+        lines, J = projector.project(x), ones
     else:
-        images, slopes = integrals_with_derivatives(x, matrices, data.grid, range(n), threads=threads)
-        lines = images.transpose(0, 2, 1).reshape(n, -1)
-        J = np.concatenate([slopes.transpose(0, 1, 3, 2).reshape(n, 6, -1), ones], axis=1)
-    return Linearised(engine=engine, x=x, J=J, r=residual_of(data, lines, state.offset))
+        lines, slopes = projector.with_derivatives(x)
+        J = np.concatenate([slopes, ones], axis=1)
+    return Linearised(projector=projector, x=x, J=J, r=residual_of(data, lines, state.offset))
 
 
 def ridge_of(volume: np.ndarray, chi: float) -> float:
@@ -141,13 +133,13 @@ class Fit:
     """How a level is fitted.
 
     precision: (6n, 6n) of the motions' prior, or None to hold the poses and fit the volume and the images' levels.
-    steps, turns, threads: as in the settings.  balls: points that move with the object, or None.
+    steps, turns: as in the settings.  workers: who calculates.  balls: points that move with the object, or None.
     """
 
     precision: Array | None
     steps: int
     turns: int
-    threads: int
+    workers: Workers
     balls: Balls | None = None
 
     def __call__(self, data: Measured, start: State) -> State:
@@ -165,18 +157,18 @@ class Fit:
 
     def _step(self, data: Measured, state: State, H: Floats | None, *, held: bool) -> tuple[State, float]:
         """One step with its line search, and the relative gain of the joint cost; H: of the preconditioner, if any."""
-        n, grid, threads = len(data.p), data.grid, self.threads
+        n = len(data.p)
         first = not state.volume.any()
-        here = linearised(data, state, threads=threads, held=held)
-        engine, x, r = here.engine, here.x, here.r
+        here = linearised(data, state, workers=self.workers, held=held)
+        projector, x, r = here.projector, here.x, here.r
         w, chi = robust_weights(r, data, first=first)
         precision = self._precision(n, held=held)
         unknown = np.concatenate([state.q, state.offset[:, None]], axis=1)[:, 6 if held else 0 :]
-        free = self._free(engine, x, w * r, first=first)
+        free = self._free(projector, x, w * r, first=first)
         ridge = 0.0 if first else ridge_of(state.volume, chi)
         balls = None if held else self.balls
         system, pull = with_balls(precision, precision @ unknown.ravel(), balls, state.q)
-        linear = Linear.of(engine, free, here.J, w, system, ridge, H)
+        linear = Linear.of(projector, free, here.J, w, system, ridge, H)
         dx, dq = linear.solve(r, pull, x, turns=2 * self.turns if first else self.turns)
 
         def cost(volume: np.ndarray, values: Array, residual: Floats) -> float:
@@ -187,9 +179,9 @@ class Fit:
         information = None if held else normal_blocks(here.motions, w)
         before, part = cost(x, unknown, r), 1.0
         while part > SHORTEST_STEP:
-            trial, values = self._tried(data, state, engine, x, (part, dx, dq), held=held)
-            at = engine if held else CpuEngine(matrices_of(data, trial.q), grid, threads=threads)
-            residual = residual_of(data, lines_of(at, values, n), trial.offset)
+            trial, values = self._tried(data, state, projector, x, (part, dx, dq), held=held)
+            at = projector if held else self.workers.projector(matrices_of(data, trial.q), data.grid)
+            residual = residual_of(data, at.project(values), trial.offset)
             own = np.concatenate([trial.q, trial.offset[:, None]], axis=1)[:, 6 if held else 0 :]
             after = cost(values, own, residual)
             if after < before or first:
@@ -201,13 +193,13 @@ class Fit:
         self,
         data: Measured,
         state: State,
-        engine: CpuEngine,
+        projector: Projector,
         x: np.ndarray,
         step: tuple[float, np.ndarray, Array],
         *,
         held: bool,
     ) -> tuple[State, np.ndarray]:
-        """The state after part of a step, and its volume as the engine holds it."""
+        """The state after part of a step, and its volume as the projector holds it."""
         part, dx, dq = step
         values = np.maximum(x + np.float32(part) * dx, 0)
         offset, q = state.offset + part * dq[:, -1], state.q
@@ -216,7 +208,7 @@ class Fit:
             centre = np.asarray(data.grid.centre)
             q = composed(q, part * dq[:, :6], centre)
             q = without_gauge(q, gauge(data.matrices.P, centre), self.precision)
-        return replace(state, volume=np.array(engine.values(values)), q=q, offset=offset), values
+        return replace(state, volume=np.array(projector.values(values)), q=q, offset=offset), values
 
     def _precision(self, n: int, *, held: bool) -> Array:
         """Of the unknowns of all views, (d n, d n): motions by the prior, levels by their own."""
@@ -225,15 +217,13 @@ class Fit:
         assert self.precision is not None
         return with_levels(self.precision)
 
-    def _free(self, engine: CpuEngine, x: np.ndarray, pulled: Array, *, first: bool) -> np.ndarray:
+    def _free(self, projector: Projector, x: np.ndarray, pulled: Array, *, first: bool) -> np.ndarray:
         """Voxels that may move: inside the grid, and not held at zero by the bound."""
         free = np.zeros(x.shape, dtype=bool)
         free[1:-2, 1:-2, 1:-2] = True
         if first:
             return free
-        n, m = len(pulled), engine.matrices
-        uphill = engine.transpose(pulled.reshape(n, m.n_u, m.n_v).transpose(0, 2, 1), range(n))
-        return free & ((x > 0) | (uphill > 0))
+        return free & ((x > 0) | (projector.back(pulled) > 0))
 
 
 def robust_weights(r: Floats, data: Measured, *, first: bool) -> tuple[Floats, float]:

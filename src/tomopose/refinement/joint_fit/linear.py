@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from tomopose.engines.cpu import CpuEngine
 from tomopose.refinement.joint_fit.precondition import Preconditioner
+from tomopose.refinement.joint_fit.projector import Projector
 from tomopose.units import Array, Floats
 
 
@@ -26,14 +26,14 @@ from tomopose.units import Array, Floats
 class Linear:
     """The linearised problem.
 
-    engine:   projector of the current matrices.  free: bool, as the engine's state; voxels that may move.
+    projector: of the current matrices.  free: bool, as its state; voxels that may move.
     J:        (n, d, N) derivatives of each view's N pixels.  w: (n, N) weights.
     factor:   Cholesky factor of M (n d, n d).  ridge: lambda.
     H:        what of each frequency the views see, or None: plain conjugate gradients.  Without a ridge a few plain
               turns are the regularisation, so that a first volume is made with them.
     """
 
-    engine: CpuEngine
+    projector: Projector
     free: np.ndarray
     J: Floats
     w: Floats
@@ -44,7 +44,7 @@ class Linear:
     @classmethod
     def of(
         cls,
-        engine: CpuEngine,
+        projector: Projector,
         free: np.ndarray,
         J: Floats,
         w: Floats,
@@ -57,19 +57,11 @@ class Linear:
         M = precision.copy()
         for j, block in enumerate(normal_blocks(J, w)):
             M[j * d : j * d + d, j * d : j * d + d] += block
-        return cls(engine=engine, free=free, J=J, w=w, factor=scipy.linalg.cho_factor(M), ridge=ridge, H=H)
-
-    def project(self, x: np.ndarray) -> Floats:
-        """A x, (n, N)."""
-        n = len(self.w)
-        lines = self.engine.forward(x, range(n)).transpose(0, 2, 1)
-        return lines.reshape(n, -1)
+        return cls(projector=projector, free=free, J=J, w=w, factor=scipy.linalg.cho_factor(M), ridge=ridge, H=H)
 
     def back(self, y: Floats) -> np.ndarray:
         """A' y over the free voxels."""
-        n, m = len(self.w), self.engine.matrices
-        images = y.reshape(n, m.n_u, m.n_v).transpose(0, 2, 1)
-        return np.where(self.free, self.engine.transpose(images, range(n)), np.float32(0))
+        return np.where(self.free, self.projector.back(y), np.float32(0))
 
     def poses(self, y: Floats, pull: Array | float = 0.0) -> Array:
         """M^-1 (J'W y - pull), (n, d)."""
@@ -86,7 +78,7 @@ class Linear:
             return None
         probe = np.random.default_rng(0).standard_normal(self.free.shape, dtype=np.float32)
         probe = np.where(self.free, probe, np.float32(0))
-        lines = self.project(probe)
+        lines = self.projector.project(probe)
         energy = float(np.einsum("np,np,np->", self.w, lines, lines, dtype=np.float64))
         return Preconditioner.of(self.H, self.free, probe, energy, self.ridge)
 
@@ -109,7 +101,7 @@ class Linear:
         for _ in range(turns):
             if size <= tolerance**2 * first or size == 0:
                 break
-            response = self.back(reduced(self.project(direction))) + ridge * direction
+            response = self.back(reduced(self.projector.project(direction))) + ridge * direction
             curvature = float(np.vdot(direction, response))
             if not curvature > 0:
                 break
@@ -120,7 +112,7 @@ class Linear:
             new = float(np.vdot(residual, eased))
             direction = eased + np.float32(new / size) * direction
             size = new
-        return dx, self.poses(r - self.project(dx), pull)
+        return dx, self.poses(r - self.projector.project(dx), pull)
 
 
 def normal_blocks(J: Floats, w: Floats) -> Array:
