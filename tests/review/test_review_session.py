@@ -119,6 +119,8 @@ def test_a_decision_adds_a_line_and_sends_only_what_changed(desk):
     assert [d["pose"] for d in accepted["decisions"]] == ["p004"]
     solved = take(5, "leave-out")
     assert len(solved["rows"]) == len(desk.review.detected)
+    assert "outline" in solved["rows"]["5"]
+    assert "outline" not in solved["rows"]["6"]  # no solve changes what was detected
     assert solved["result"]["used"] == used - 1
     undone = desk.take(lambda r: r.without_last())
     assert (undone["keep"], undone["decisions"]) == (2, [])
@@ -130,7 +132,7 @@ def test_a_page_that_follows_the_changes_shows_the_whole_state(desk):
     for row, action in ((3, "accept"), (7, "leave-out"), (3, "leave-out"), (-1, "undo"), (9, "accept"), (-1, "undo")):
         decision = None if action == "undo" else desk.decision({"row": row, "action": action})
         found = desk.take(lambda r, d=decision: r.without_last() if d is None else r.with_decision(d))
-        rows = [found["rows"].get(str(k), old) for k, old in enumerate(shown["rows"])]
+        rows = [{**old, **found["rows"].get(str(k), {})} for k, old in enumerate(shown["rows"])]
         decisions = [*shown["decisions"][: found["keep"]], *found["decisions"]]
         shown = {"rows": rows, "result": found.get("result", shown["result"]), "decisions": decisions}
         assert json.dumps(plain(shown)) == json.dumps(plain(state_view(desk.review)))

@@ -42,6 +42,21 @@ PARAMETER_UNITS: Mapping[str, str] = MappingProxyType(
 """Every continuous parameter of a scanner and its unit; in files the name is `NAME_UNIT`."""
 
 
+def intrinsic_matrices(d_SD: Array, p_u: Array, p_v: Array, u_0: Array, v_0: Array, panel: Array) -> Array:
+    """Matrices (a, 3, 3) of eq. (2), the last row of length 1, from numbers (a,) and rotations `panel` (a, 3, 3) in S.
+
+    The inverse of the columns is (U, V, O): a point O + u U + v V of the panel has the homogeneous pixel (u, v, 1).
+    """
+    # the axes of the panel are the columns r of R: along the third, y_3 = r_3 . x_S is 1 in every pixel
+    r_1, r_2, r_3 = (panel[:, :, k] for k in range(3))
+    in_u, in_v = d_SD / p_u, d_SD / p_v
+    K = np.empty((len(panel), 3, 3))
+    K[:, 0] = (u_0 + in_u * panel[:, 2, 0])[:, None] * r_3 - (in_u * panel[:, 2, 2])[:, None] * r_1
+    K[:, 1] = (v_0 - in_v * panel[:, 2, 1])[:, None] * r_3 + (in_v * panel[:, 2, 2])[:, None] * r_2
+    K[:, 2] = r_3
+    return K
+
+
 @value
 class Scanner:
     """Intrinsic geometry of a cone-beam scanner.
@@ -149,24 +164,15 @@ class Scanner:
     def K(self) -> Array:
         """Intrinsic matrix (3, 3) of eq. (2), scaled so that its last row has length 1.
 
-        Without roll and tilts it is the printed matrix.  In general its columns' inverse is (U, V, O): a point
-        O + u U + v V of the panel has the homogeneous pixel (u, v, 1).
+        Without roll and tilts it is the printed matrix; else see `intrinsic_matrices`.
         """
         if self.eta == self.theta == self.phi == 0.0:
             return np.array(
                 [[-self.d_SD / self.p_u, 0.0, self.u_0], [0.0, self.d_SD / self.p_v, self.v_0], [0.0, 0.0, 1.0]]
             )
-        # the axes of the panel are the columns r of R: along the third, y_3 = r_3 . x_S is 1 in every pixel
-        R = self._panel_axes
-        (r_1, r_2, r_3), R_3 = R.T, R[2]
-        in_u, in_v = self.d_SD / self.p_u, self.d_SD / self.p_v
-        return np.array(
-            [
-                (self.u_0 + in_u * R_3[0]) * r_3 - in_u * R_3[2] * r_1,
-                (self.v_0 - in_v * R_3[1]) * r_3 + in_v * R_3[2] * r_2,
-                r_3,
-            ]
-        )
+        numbers = np.array([[self.d_SD], [self.p_u], [self.p_v], [self.u_0], [self.v_0]])
+        K: Array = intrinsic_matrices(*numbers, panel=self._panel_axes[None])[0]
+        return K
 
     @property
     def P_S(self) -> Array:

@@ -38,33 +38,51 @@ def worst_first(review: Review) -> list[int]:
 
 def rows_view(review: Review, which: Sequence[int] | None = None) -> list[dict[str, Any]]:
     """One mapping a detection; of all of them, or of some rows."""
-    o, cal = review.observations, review.calibration
-    predicted, d = residual_lengths(review)
-    usual = float(np.median(cal.d)) if len(cal.pose_id) else float("nan")
-    used, last = set(cal.pose_id), {x.pose_id: x for x in review.decisions}
-    x_D, sigma, at, far = (_shown(v) for v in (o.x_D, np.linalg.norm(o.sigma, axis=1), predicted, d))
-    times = _shown(d / usual) if usual > 0 else [None] * len(o)
+    rows = range(len(review.detected)) if which is None else which
+    return [{**one, **of_fit} for one, of_fit in zip(_detections(review, rows), _in_the_fit(review, rows), strict=True)]
+
+
+def _detections(review: Review, which: Sequence[int]) -> list[dict[str, Any]]:
+    """What of some rows no new solve changes: the detection, and the decision about it."""
+    o, last = review.observations, {x.pose_id: x for x in review.decisions}
+    some = np.asarray(which, dtype=np.int64)
+    x_D, sigma = _shown(o.x_D[some]), _shown(np.linalg.norm(o.sigma[some], axis=1))
     out = []
-    for k in range(len(o)) if which is None else which:
-        pose = o.pose_id[k]
-        decision = last.get(pose)
+    for k, x, s in zip(which, x_D, sigma, strict=True):
+        decision = last.get(o.pose_id[k])
         out.append(
             {
-                "pose": pose,
+                "pose": o.pose_id[k],
                 "image": "" if o.image is None else o.image[k],
-                "used": pose in used,
-                "status": cal.outliers.get(pose) or (o.status[k] if o.status is not None else ""),
-                "x": x_D[k],
-                "sigma": sigma[k],
-                "predicted": at[k],
-                "d": far[k],
-                "times": times[k],
+                "x": x,
+                "sigma": s,
                 "outline": _outline(o, k),
                 "decision": None if decision is None else decision.action,
                 "words": "" if decision is None else decision.words,
             }
         )
     return out
+
+
+def _in_the_fit(review: Review, which: Sequence[int]) -> list[dict[str, Any]]:
+    """What of some rows each solve changes."""
+    o, cal = review.observations, review.calibration
+    some = np.asarray(which, dtype=np.int64)
+    predicted, d = residual_lengths(review)
+    usual = float(np.median(cal.d)) if len(cal.pose_id) else float("nan")
+    at, far = _shown(predicted[some]), _shown(d[some])
+    times = _shown(d[some] / usual) if usual > 0 else [None] * len(some)
+    used = set(cal.pose_id)
+    return [
+        {
+            "used": o.pose_id[k] in used,
+            "status": cal.outliers.get(o.pose_id[k]) or (o.status[k] if o.status is not None else ""),
+            "predicted": p,
+            "d": f,
+            "times": t,
+        }
+        for k, p, f, t in zip(which, at, far, times, strict=True)
+    ]
 
 
 DIGITS = 7
@@ -129,15 +147,19 @@ def decisions_view(decisions: Sequence[Decision]) -> list[dict[str, str]]:
 def changes_view(before: Review, after: Review) -> dict[str, Any]:
     """What the page of `before` must change to show `after`.
 
-    rows: by their number, those that differ: of a decision that left the calibration as it is, one;  result: where it
-    was solved again;  keep: how many of the decisions stay, oldest first, and decisions: those that follow.
+    rows: by their number, what of them differs: of a decision that left the calibration as it is, one whole row, and
+    where it was solved again, what follows from the fit of the others too;  result: where it was solved again;  keep:
+    how many of the decisions stay, oldest first, and decisions: those that follow.
     """
     keep = sum(1 for _ in takewhile(lambda p: p[0] is p[1], zip(before.decisions, after.decisions, strict=False)))
     solved = after.calibration is not before.calibration
     poses = {d.pose_id for d in (*before.decisions[keep:], *after.decisions[keep:])}
-    which = [k for k, pose in enumerate(after.detected.pose_id) if solved or pose in poses]
+    decided = [k for k, pose in enumerate(after.detected.pose_id) if pose in poses]
     more = {"result": result_view(after.calibration)} if solved else {}
-    rows = {str(k): row for k, row in zip(which, rows_view(after, which), strict=True)}
+    refitted = range(len(after.detected)) if solved else decided
+    rows = {str(k): row for k, row in zip(refitted, _in_the_fit(after, refitted), strict=True)}
+    for k, row in zip(decided, _detections(after, decided), strict=True):
+        rows[str(k)] |= row
     return {"rows": rows, "keep": keep, "decisions": decisions_view(after.decisions[keep:]), **more}
 
 

@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.model.silhouettes import Cameras
 from tomopose.calibration.rigid.estimate import LIKELY
 from tomopose.errors import InputError
-from tomopose.units import Array
 
 OUTSIDE = 1.0
 """Of the panel's larger side.  A simulated or predicted table may reach beyond the panel and is right all the same;
@@ -43,20 +41,6 @@ class Placement:
     @property
     def likely(self) -> bool:
         return self.possible and self.off_axis < np.log(LIKELY)
-
-
-def placement(problem: Problem, x_T: Array, cameras: Cameras) -> Placement:
-    """Of a fit that places the ball of each row at x_T (n, 3), mm in T."""
-    beam = cameras.beam
-    z = np.sort((beam[:, :3] * x_T).sum(axis=1) + beam[:, 3])
-    first = problem.scanners[problem.run[0]]
-    return Placement(
-        nearest=float(z[0]),
-        median=float((z[(len(z) - 1) // 2] + z[len(z) // 2]) / 2),
-        farthest=float(z[-1]),
-        d_SD=min(s.d_SD for s in problem.scanners),
-        d_SR=first.d_SR,
-    )
 
 
 def require_on_panel(problem: Problem) -> None:

@@ -16,11 +16,17 @@ from tomopose.units import Array
 WIDENING_PROBABILITY = 0.01
 
 
+def medians(values: Array) -> Array:
+    """Of each row of (..., n) numbers, n > 0; NaN where one is.  For some hundred numbers in a fifth of the time of
+    numpy's."""
+    s, n = np.sort(values, axis=-1), values.shape[-1]  # NaN is last
+    middle: Array = np.where(np.isnan(s[..., -1]), np.nan, (s[..., (n - 1) // 2] + s[..., n // 2]) / 2)
+    return middle
+
+
 def median(values: Array) -> float:
-    """Of (n,) numbers, n > 0; NaN where one is.  For some hundred numbers in a fifth of the time of numpy's."""
-    s = np.sort(values)  # NaN is last
-    middle = (s[(len(s) - 1) // 2] + s[len(s) // 2]) / 2
-    return float("nan") if np.isnan(s[-1]) else float(middle)
+    """Of (n,) numbers, as of `medians`."""
+    return float(medians(values))
 
 
 def inverse_information(N: Array) -> Array:

@@ -10,10 +10,11 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from tomopose.calibration.model.ball_projection import SCANNER_COLUMNS
 from tomopose.errors import InputError
-from tomopose.geometry.scanner import PARAMETER_UNITS, Scanner
+from tomopose.geometry.scanner import LARGEST_TILT, PARAMETER_UNITS, Scanner
 from tomopose.units import Array
 
 UNITS: Mapping[str, str] = MappingProxyType({**PARAMETER_UNITS, "pitch_ratio": "", "translation_scale": ""})
@@ -146,6 +147,23 @@ def free_parameters(
 
 class ImpossibleScannerError(InputError):
     """A fit moved freed scanner values to where no scanner is: they cannot explain the data."""
+
+
+def scanner_vectors_at(s_0: Array, free: FreeParameters, delta: Array) -> Array:
+    """(a, runs, 13): the scanner vectors s_0 (runs, 13) with each of the deviations delta (a, f) applied."""
+    s = np.repeat(s_0[None], len(delta), axis=0)
+    for r in range(len(s_0)):
+        mine = (free.col_run < 0) | (free.col_run == r)
+        s[:, r, free.cols[mine]] += (free.factor * delta)[:, mine]
+    return s
+
+
+def scanners_can_be(s: Array) -> npt.NDArray[np.bool_]:
+    """(a,): whether scanner vectors s (a, runs, 13) are ones that a `Scanner` accepts."""
+    d_SD, d_SR, p_u, p_v, theta, phi, tilt_x, tilt_y = (s[..., k] for k in (0, 1, 2, 3, 7, 8, 10, 11))
+    tilts = np.maximum(np.maximum(abs(theta), abs(phi)), np.maximum(abs(tilt_x), abs(tilt_y)))
+    can_be = (d_SR > 0) & (d_SD > d_SR) & (p_u > 0) & (p_v > 0) & (tilts <= LARGEST_TILT)
+    return np.asarray(can_be.all(axis=1))
 
 
 def adjusted_scanners(scanners: tuple[Scanner, ...], free: FreeParameters, delta: Array) -> tuple[Scanner, ...]:

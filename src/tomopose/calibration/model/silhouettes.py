@@ -9,7 +9,8 @@ import numpy.typing as npt
 
 from tomopose.calibration.model.covariance import median
 from tomopose.calibration.model.problem import Problem
-from tomopose.geometry.scanner import R_WS, Scanner
+from tomopose.geometry.rotations import R_x, R_y, R_z
+from tomopose.geometry.scanner import R_WS, Scanner, intrinsic_matrices
 from tomopose.geometry.transforms import RigidTransform
 from tomopose.units import Array
 
@@ -39,22 +40,22 @@ class Cameras:
             run.append(np.full(len(angles), r))
             which[mine] = k + place.reshape(-1)
             k += len(angles)
-        to_S = [_table_to_source(s, a) for s, a in zip(problem.scanners, alpha, strict=True)]
-        first = np.concatenate(to_S)[which[0]]
-        runs = np.concatenate(run)
+        s = problem.s_0
+        to_S = np.concatenate([_table_to_source(one[None], a)[0] for one, a in zip(s, alpha, strict=True)])
+        first, runs = to_S[which[0]], np.concatenate(run)
         return cls(
-            at_angle=np.concatenate([s.K @ T for s, T in zip(problem.scanners, to_S, strict=True)]),
-            beams=np.concatenate([T[:, 2] for T in to_S]),
+            at_angle=_intrinsic(s)[runs] @ to_S,
+            beams=to_S[:, 2],
             alpha=tuple(alpha),
             which=which,
-            d_SR=np.array([s.d_SR for s in problem.scanners])[runs][which],
+            d_SR=s[runs[which], 1],
             source=-first[:, :3].T @ first[:, 3],
         )
 
-    def seen_by(self, scanners: tuple[Scanner, ...]) -> Array:
-        """(k, 3, 4): `at_angle` of scanners with other values."""
-        each = [s.K @ _table_to_source(s, a) for s, a in zip(scanners, self.alpha, strict=True)]
-        return each[0] if len(each) == 1 else np.concatenate(each)
+    def seen_by(self, s: Array) -> Array:
+        """(a, k, 3, 4): `at_angle` of scanners with other values, s (a, runs, 13) as of `scanner_vector`."""
+        each = [_intrinsic(s[:, r])[:, None] @ _table_to_source(s[:, r], alpha) for r, alpha in enumerate(self.alpha)]
+        return each[0] if len(each) == 1 else np.concatenate(each, axis=1)
 
     @property
     def P(self) -> Array:
@@ -67,12 +68,21 @@ class Cameras:
         return np.asarray(self.beams[self.which])
 
 
-def _table_to_source(scanner: Scanner, alpha: Array) -> Array:
-    """(k, 3, 4): from T to S at table angles (k,)."""
-    T_TW = scanner.T_TW(alpha)
-    T = np.empty((len(alpha), 3, 4))
-    T[:, :, :3], T[:, :, 3] = R_WS @ T_TW.R, T_TW.t @ R_WS.T
-    T[:, 2, 3] += scanner.d_SR
+def _intrinsic(s: Array) -> Array:
+    """(a, 3, 3): from S to pixels, of scanner vectors s (a, 13)."""
+    d_SD, _, p_u, p_v, u_0, v_0, eta, theta, phi = s.T[:9]
+    return intrinsic_matrices(d_SD, p_u, p_v, u_0, v_0, R_x(theta) @ R_y(phi) @ R_z(eta))
+
+
+def _table_to_source(s: Array, alpha: Array) -> Array:
+    """(a, k, 3, 4): from T to S at table angles (k,), of scanner vectors s (a, 13); see `Scanner.T_TW`."""
+    d_SR, (axis_y, tilt_x, tilt_y) = s[:, 1], s.T[9:12]
+    axis = (R_x(tilt_x) @ R_y(tilt_y))[:, None]
+    R = axis @ R_z(alpha) @ np.swapaxes(axis, -1, -2)
+    t = axis_y[:, None, None] * (np.array([0.0, 1.0, 0.0]) - R[..., 1])
+    T = np.empty((*R.shape[:2], 3, 4))
+    T[..., :3], T[..., 3] = R_WS @ R, t @ R_WS.T
+    T[..., 2, 3] += d_SR[:, None]
     return T
 
 
@@ -83,26 +93,23 @@ def chain_matrices(problem: Problem, scanners: tuple[Scanner, ...], T_HT: RigidT
     return np.asarray(Cameras.of(replace(problem, scanners=scanners)).P @ T_HT.matrix @ T_MH)
 
 
-def silhouette_outlines(P: Array, centres: Array, diameter: float, which: npt.NDArray[np.int64] | None = None) -> Array:
-    """(n,) px^2: product of the semi axes of the silhouettes of balls at centres (n, 3), under P (n, 3, 4), or (k, 3,
-    4) where `which` (n,) names the one of every ball.
+def silhouette_outlines(P: Array, centres: Array, diameter: float) -> Array:
+    """(n,) px^2: product of the semi axes of the silhouettes of balls at centres (n, 3), under P (n, 3, 4).
 
     The dual quadric of a sphere, x x^T - r^2 diag(1, 1, 1, 0), has the dual conic P Q P^T as its outline (Hartley and
     Zisserman, Multiple View Geometry, sec. 8.3), which gives the ellipse's centre and shape: with C = P Q P^T scaled to
     C_33 = 1, S = m m^T - C_12, where m is the upper part of its last column.
     """
-    M = P[:, :, :3]
-    quadric = (diameter / 2.0) ** 2 * (M @ np.swapaxes(M, 1, 2))
-    B = [quadric[:, i, j] for i, j in _UPPER]
-    if which is None:
-        y = (M @ centres[:, :, None])[..., 0] + P[:, :, 3]
-    elif len(P) == 1:  # one camera sees all
-        y = centres @ M[0].T + P[0, :, 3]
-    else:
-        B = [b[which] for b in B]
-        y = (centres @ np.swapaxes(M, 1, 2) + P[:, None, :, 3])[which, np.arange(len(which))]
-    a, b, c = y.T
-    B_aa, B_ab, B_ac, B_bb, B_bc, B_cc = B
+    M = P[..., :3]
+    return outlines_of(M @ np.swapaxes(M, -1, -2), (M @ centres[..., None])[..., 0] + P[..., 3], diameter)
+
+
+def outlines_of(MM: Array, y: Array, diameter: float) -> Array:
+    """The same of products M M^T (..., n, 3, 3) of the left parts M of the matrices, and images y (..., n, 3) of the
+    centres, not divided by the depth."""
+    quadric = (diameter / 2.0) ** 2
+    B_aa, B_ab, B_ac, B_bb, B_bc, B_cc = (quadric * MM[..., i, j] for i, j in _UPPER)
+    a, b, c = (y[..., i] for i in range(3))
     scale = 1.0 / (c * c - B_cc)
     m_a, m_b = (a * c - B_ac) * scale, (b * c - B_bc) * scale
     S_aa, S_bb = m_a * m_a - (a * a - B_aa) * scale, m_b * m_b - (b * b - B_bb) * scale
@@ -114,17 +121,11 @@ def silhouette_outlines(P: Array, centres: Array, diameter: float, which: npt.ND
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
-def size_ratio_of(
-    problem: Problem,
-    P: Array,
-    centres: Array,
-    diameter: float | None = None,
-    which: npt.NDArray[np.int64] | None = None,
-) -> float | None:
+def size_ratio_of(problem: Problem, P: Array, centres: Array, diameter: float | None = None) -> float | None:
     """Median over the rows of the measured size of the silhouette over the calculated one.
 
-    P, centres (n, 3), which: as of `silhouette_outlines`, of the ball of each row;  diameter: mm, in place of the
-    problem's own.  None without outlines or without a diameter.
+    P (n, 3, 4), centres (n, 3): of the ball of each row;  diameter: mm, in place of the problem's own.  None without
+    outlines or without a diameter.
     """
     diameter = problem.ball_diameter if diameter is None else diameter
     if problem.outline is None or diameter is None:
@@ -134,8 +135,7 @@ def size_ratio_of(
         return None
     measured = problem.outline
     if not known.all():
-        measured, centres = measured[known], centres[known]
-        P, which = (P[known], None) if which is None else (P, which[known])
-    calculated = silhouette_outlines(P, centres, diameter, which)
+        measured, P, centres = measured[known], P[known], centres[known]
+    calculated = silhouette_outlines(P, centres, diameter)
     with np.errstate(divide="ignore"):
         return float(np.sqrt(median(measured / calculated)))

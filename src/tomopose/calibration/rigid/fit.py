@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 from tomopose.calibration.model.ball_projection import (
     BALLS,
@@ -62,8 +63,18 @@ class Fit:
         return RigidTransform(R=self.R_HT, t=self.t_HT, source=Frame.H, target=Frame.T)
 
 
-def rows_of(problem: Problem, weight: Array | None = None) -> Rows:
-    """The rows of a problem as the kernel takes them; weight (n,) on the squared residuals, or all 1."""
+def rows_of(problem: Problem, weight: Array | None = None, some: npt.NDArray[np.int64] | None = None) -> Rows:
+    """The rows of a problem as the kernel takes them, all or some (k,); weight (n,) on the squared residuals of all,
+    or all 1."""
+    if some is not None:
+        return Rows(
+            x=problem.x_D[some],
+            W=problem.W[some],
+            weight=np.ones(len(some)),
+            poses=problem.poses[some],
+            run=problem.run[some],
+            ball=problem.ball[some],
+        )
     w = np.ones(len(problem)) if weight is None else np.ascontiguousarray(weight, dtype=np.float64)
     return Rows(
         x=problem.x_D,
@@ -88,11 +99,13 @@ def minimise(
     start: Fit | tuple[Array, Array, Array],
     *,
     weight: Array | None = None,
+    rows: npt.NDArray[np.int64] | None = None,
     iterations: int = ITERATIONS,
     tolerance: float = STEP_TOLERANCE,
 ) -> Fit:
-    """The optimum reached from a start (a fit, or R_HT, t_HT, t), with weights (n,) on the squared residuals.
+    """The optimum reached from a start (a fit, or R_HT, t_HT, t).
 
+    weight: (n,) on the squared residuals, or rows: some rows (k,) alone.
     tolerance: in standard deviations, of the last step.
     """
     R, t_HT, t = (start.R_HT, start.t_HT, start.t) if isinstance(start, Fit) else start
@@ -100,7 +113,7 @@ def minimise(
     damping = NEAR_DAMPING if isinstance(start, Fit) and start.converged else DAMPING
     at = np.concatenate([R.ravel(), t_HT, t.ravel(), delta])
     chi2, code, at, N = levenberg_marquardt(
-        rows_of(problem, weight), freed_of(problem, free), at, iterations, damping, tolerance
+        rows_of(problem, weight, rows), freed_of(problem, free), at, iterations, damping, tolerance
     )
     R, free_from = at[:9].reshape(3, 3), len(at) - len(delta)
     return Fit(
@@ -121,15 +134,6 @@ def residuals(problem: Problem, free: FreeParameters, fit: Fit) -> Array:
     scanner_vectors(freed_of(problem, free), fit.delta, s)
     x = projected_centres(s, problem.run, fit.R_HT, fit.t_HT, problem.poses, fit.t[problem.ball])
     return np.asarray(problem.x_D - x)
-
-
-def balls_in_table(problem: Problem, fit: Fit) -> Array:
-    """(n, 3) mm: where a fit places the ball of each row in T, the poses as reported."""
-    if len(fit.t) == 1:
-        x_H = (problem.R_MH.reshape(-1, 3) @ fit.t[0]).reshape(-1, 3) + problem.t_MH
-    else:
-        x_H = (problem.R_MH @ fit.t[problem.ball][:, :, None])[..., 0] + problem.t_MH
-    return np.asarray(x_H @ fit.R_HT.T + fit.t_HT)
 
 
 def whitened2(problem: Problem, r: Array) -> Array:

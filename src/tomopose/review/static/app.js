@@ -130,10 +130,10 @@ function nextUndecided() {
   go(i === undefined ? place + 1 : i);
 }
 
-/* An answer holds what changed: rows by number, decisions after those that stay, a result where it was solved again. */
+/* An answer holds what changed: what of the rows differs, by number, decisions after those that stay, a result where it was solved again. */
 function merge(found) {
   const rows = state.rows.slice();
-  Object.entries(found.rows).forEach(([k, row]) => { rows[k] = row; });
+  Object.entries(found.rows).forEach(([k, row]) => { rows[k] = { ...rows[k], ...row }; });
   state = { ...state, rows, decisions: [...state.decisions.slice(0, found.keep), ...found.decisions], result: found.result ?? state.result };
 }
 

@@ -77,10 +77,12 @@ def _lag(lag: int) -> Change:
         image = np.flatnonzero(place[found] == place + lag)
         if len(image) < FEWEST_PAIRS:
             return None
-        pose = found[image]
-        of_pose, of_image = p.select(pose), p.select(image)
         return replace(
-            of_pose, x_D=of_image.x_D, covariance=of_image.covariance, W=of_image.W, outline=of_image.outline
+            p.select(found[image]),
+            x_D=p.x_D[image],
+            covariance=p.covariance[image],
+            W=p.W[image],
+            outline=None if p.outline is None else p.outline[image],
         )
 
     return change

@@ -18,11 +18,8 @@ from tomopose.calibration.checks.conventions.alternatives import ALTERNATIVES, A
 from tomopose.calibration.checks.conventions.fits import (
     HOPELESS,
     Fitted,
-    Left,
     Reading,
     fitted,
-    linear_starts,
-    size_ratio,
 )
 from tomopose.calibration.checks.conventions.hypothesis import (
     BETTER,
@@ -32,13 +29,14 @@ from tomopose.calibration.checks.conventions.hypothesis import (
     compared,
     rank,
 )
-from tomopose.calibration.checks.placement import Placement, better_placed, placement
+from tomopose.calibration.checks.conventions.remainder import Remainder, remainders
+from tomopose.calibration.checks.placement import better_placed
 from tomopose.calibration.checks.stability import SIGNIFICANT, Effect, chi2_with_movements, movements
 from tomopose.calibration.model.parameters import UNITS, FreeParameters, free_parameters
 from tomopose.calibration.model.problem import Problem, pair
 from tomopose.calibration.model.silhouettes import Cameras
 from tomopose.calibration.rigid.estimate import best_fit
-from tomopose.calibration.rigid.fit import Fit, balls_in_table, residuals, whitened2
+from tomopose.calibration.rigid.fit import Fit
 from tomopose.calibration.rigid.start import ray_equations
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
@@ -59,12 +57,7 @@ class _Declared:
     problem: Problem
     free: FreeParameters
     fit: Fit
-    x_T: Array
-    cameras: Cameras
-
-    @functools.cached_property
-    def placed(self) -> Placement:
-        return placement(self.problem, self.x_T, self.cameras)
+    left: Remainder
 
     @functools.cached_property
     def n_prior(self) -> int:
@@ -88,8 +81,7 @@ class _Declared:
 
     @functools.cached_property
     def own(self) -> Hypothesis:
-        r = residuals(self.problem, self.free, self.fit)
-        left = Left.of(self.problem, r, whitened2(self.problem, r))
+        left = self.left
         return Hypothesis(
             name="declared",
             words="the data as declared",
@@ -101,11 +93,11 @@ class _Declared:
             delta=0.0,
             factor=1.0,
             outcome="declared",
-            ball_mm=self.placed.median,
-            d_SR=self.placed.d_SR,
-            possible=self.placed.possible,
+            ball_mm=left.placed.median,
+            d_SR=left.placed.d_SR,
+            possible=left.placed.possible,
             share=left.share,
-            size_ratio=size_ratio(self.problem, self.free, self.fit, self.x_T, self.cameras),
+            size_ratio=left.size_ratio,
         )
 
 
@@ -125,8 +117,7 @@ def ranked(
     held = free_parameters(problem.scanners, fix=tuple(UNITS))
     cameras = Cameras.of(problem)
     rays = ray_equations(problem, cameras)
-    x_T = balls_in_table(problem, fit)
-    declared = _Declared(problem=problem, free=free, fit=fit, x_T=x_T, cameras=cameras)
+    declared = _Declared(problem=problem, free=free, fit=fit, left=remainders([problem], [cameras], [fit], free)[0])
     hopeless = HOPELESS * max(fit.chi2, float(declared.own.dof))
 
     def readings() -> Iterator[tuple[Alternative, Reading]]:
@@ -141,22 +132,22 @@ def ranked(
 
     found, left = [declared.own], readings()
     while tried := list(itertools.islice(left, max(1, ROWS_AT_ONCE // len(problem)))):
-        for (alternative, one), start in zip(tried, linear_starts([one for _, one in tried]), strict=True):
-            other = fitted(one, start, free, held, starts=starts, hopeless=hopeless)
+        others = fitted([one for _, one in tried], free, held, starts=starts, hopeless=hopeless)
+        for (alternative, one), other in zip(tried, others, strict=True):
             if not np.isfinite(other.fit.chi2):
                 continue
-            judged = _judged_beside_movements(declared, alternative, one, other)
+            judged = _judged_beside_movements(declared, alternative, one.problem, other)
             if judged is not None:
                 found.append(judged)
     return Diagnosis(hypotheses=rank(found))
 
 
 def _judged_beside_movements(
-    declared: _Declared, alternative: Alternative, one: Reading, other: Fitted
+    declared: _Declared, alternative: Alternative, changed: Problem, other: Fitted
 ) -> Hypothesis | None:
     """The judgement; where the alternative fits better and something still moved under it, with both free to move."""
-    changed, free, fit = one.problem, declared.free, other.fit
-    judged = _judged(declared, alternative, one, other, declared.fit.chi2)
+    free, fit = declared.free, other.fit
+    judged = _judged(declared, alternative, changed, other, declared.fit.chi2)
     if judged is None or judged.delta > -BETTER:
         return judged
     moved = _moved(changed, free, fit)
@@ -164,7 +155,7 @@ def _judged_beside_movements(
         return judged
     following = replace(other, fit=replace(fit, chi2=chi2_with_movements(changed, free, fit, moved)))
     chi2 = chi2_with_movements(declared.problem, free, declared.fit, moved)
-    still = _judged(declared, alternative, one, following, chi2)
+    still = _judged(declared, alternative, changed, following, chi2)
     if still is not None and still.outcome == "better":
         return replace(judged, outcome="better", sigmas=still.sigmas)
     return judged if still is None or judged.outcome != "better" else replace(still, chi2=fit.chi2)
@@ -175,14 +166,10 @@ def _moved(problem: Problem, free: FreeParameters, fit: Fit) -> list[Effect]:
 
 
 def _judged(
-    declared: _Declared, alternative: Alternative, one: Reading, other: Fitted, chi2: float
+    declared: _Declared, alternative: Alternative, changed: Problem, other: Fitted, chi2: float
 ) -> Hypothesis | None:
     """The comparison of one alternative; None where it puts a ball where none can be, or only renames the unit."""
-    changed, fit = one.problem, other.fit
-    x_T = balls_in_table(changed, fit)
-    placed = placement(changed, x_T, one.cameras)
-    left = Left.of(changed, other.r, other.d2)
-    dof = declared.dof(changed)
+    fit, left, placed, dof = other.fit, other.left, other.left.placed, declared.dof(changed)
     judged = compared(
         declared.hypothesis(chi2),
         Hypothesis(
@@ -203,10 +190,10 @@ def _judged(
             d_SR=placed.d_SR,
             possible=placed.possible,
             share=left.share,
-            size_ratio=size_ratio(changed, declared.free, fit, x_T, one.cameras),
+            size_ratio=left.size_ratio,
         ),
     )
-    likelier = better_placed(placed, declared.placed) and not changed.units_confirmed
+    likelier = better_placed(placed, declared.left.placed) and not changed.units_confirmed
     better = judged.outcome == "better" or (judged.outcome == "unfit" and judged.delta < -BETTER)
     if alternative.length_factor != 1.0 and not likelier and not (better and placed.possible):
         # centres alone cannot show the unit while the table keeps one angle; the ball's place on the beam can

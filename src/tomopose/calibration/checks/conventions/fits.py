@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import functools
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from tomopose.calibration.checks.conventions.hypothesis import BELONGING, BELONGING_MEAN
-from tomopose.calibration.model.parameters import (
-    UNITS,
-    FreeParameters,
-    ImpossibleScannerError,
-    adjusted_scanners,
-    free_parameters,
-)
+from tomopose.calibration.checks.conventions.remainder import Remainder, remainders
+from tomopose.calibration.model.parameters import UNITS, FreeParameters, free_parameters
 from tomopose.calibration.model.problem import Problem
-from tomopose.calibration.model.silhouettes import Cameras, size_ratio_of
-from tomopose.calibration.rigid.fit import Fit, minimise, residuals, whitened2
+from tomopose.calibration.model.silhouettes import Cameras
+from tomopose.calibration.rigid.fit import Fit, minimise
 from tomopose.calibration.rigid.kernel import STEP_TOLERANCE
 from tomopose.calibration.rigid.start import Rays, closed_forms, other_starts, ray_equations, turned_about_beam
 from tomopose.units import Array
@@ -41,49 +34,6 @@ SCANNER_GAIN = 1e3
 
 AT_ONCE = 4096
 """Rows whose linear starts are calculated together: some megabytes."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Left:
-    """What a fit leaves.  d_rms: px;  sigmas: rms residual of a coordinate in stated standard uncertainties, of the
-    80 % of the centres that fit best;  share: d_rms over the rms spread of the centres."""
-
-    d_rms: float
-    sigmas: float
-    share: float
-
-    @classmethod
-    def of(cls, problem: Problem, r: Array, d2: Array) -> Left:
-        """r (n, 2) px, d2 (n,): residuals of all rows, and their squares in standard deviations."""
-        n = len(d2)
-        kept = np.sort(d2)[: max(1, int(np.ceil(BELONGING * n)))]
-        d_rms = math.sqrt(float(np.vdot(r, r)) / n)
-        from_mean = problem.x_D - problem.x_D.sum(axis=0) / n
-        spread = math.sqrt(float(np.vdot(from_mean, from_mean)) / n)
-        return cls(
-            d_rms=d_rms,
-            sigmas=math.sqrt(float(kept.sum()) / len(kept) / BELONGING_MEAN),
-            share=d_rms / spread if spread > 0 else 0.0,
-        )
-
-
-def size_ratio(problem: Problem, free: FreeParameters, fit: Fit, x_T: Array, cameras: Cameras) -> float:
-    """Measured size of the silhouettes over the calculated one; NaN where it is not known or cannot be calculated.
-
-    x_T (n, 3) mm: where the fit places the balls;  cameras: of the problem's scanners, before the fit moved them.
-    """
-    if problem.outline is None or problem.ball_diameter is None or not np.isfinite(fit.chi2):
-        return float("nan")
-    if fit.delta.any():
-        try:
-            scanners = adjusted_scanners(problem.scanners, free, fit.delta)
-        except ImpossibleScannerError:  # a wrong reading may end anywhere
-            return float("nan")
-        P = cameras.seen_by(scanners)
-    else:
-        P = cameras.at_angle
-    found = size_ratio_of(problem, P, x_T, which=cameras.which)
-    return float("nan") if found is None else found
 
 
 @functools.lru_cache(maxsize=16)
@@ -124,13 +74,9 @@ class Reading:
         return len(self.rows) == len(self.problem)
 
     @property
-    def weight(self) -> Array | None:
-        """(n,) 1 for the rows that it is fitted to first; None for all."""
-        if self.whole:
-            return None
-        weight = np.zeros(len(self.problem))
-        weight[self.rows] = 1.0
-        return weight
+    def first(self) -> npt.NDArray[np.int64] | None:
+        """(k,): the rows that it is fitted to first; None for all."""
+        return None if self.whole else self.rows
 
 
 def linear_starts(readings: Sequence[Reading]) -> list[tuple[Array, Array, Array]]:
@@ -152,15 +98,42 @@ def linear_starts(readings: Sequence[Reading]) -> list[tuple[Array, Array, Array
 
 @dataclass(frozen=True, kw_only=True)
 class Fitted:
-    """fit: the optimum, or where part of the rows lead;  r (n, 2) px: what it leaves in all rows;  d2 (n,): their
-    squares in standard deviations."""
+    """fit: the optimum, or where part of the rows lead;  left: what it leaves in all rows."""
 
     fit: Fit
-    r: Array
-    d2: Array
+    left: Remainder
 
 
 def fitted(
+    readings: Sequence[Reading], free: FreeParameters, held: FreeParameters, *, starts: int, hopeless: float
+) -> list[Fitted]:
+    """The optimum under each reading, or where part of the rows lead if that leaves a hopeless chi2 in all rows.
+
+    starts: rotations that are tried where the closed form leads nowhere.
+    """
+    fits = [
+        _of_first_rows(one, start, free, held, starts=starts, hopeless=hopeless)
+        for one, start in zip(readings, linear_starts(readings), strict=True)
+    ]
+    found = []
+    for one, fit, left in zip(readings, fits, _left(readings, fits, free), strict=True):
+        if not one.whole:
+            # a ball behind the source in any row makes the reading impossible
+            fit = replace(fit, chi2=left.chi2 if np.isfinite(left.chi2) else np.inf)
+        found.append(Fitted(fit=fit, left=left))
+    hopeful = [k for k, one in enumerate(readings) if not one.whole and found[k].fit.chi2 < hopeless]
+    again = [minimise(readings[k].problem, free, found[k].fit, iterations=ITERATIONS) for k in hopeful]
+    for k, fit, left in zip(hopeful, again, _left([readings[k] for k in hopeful], again, free), strict=True):
+        found[k] = Fitted(fit=fit, left=left)
+    return found
+
+
+def _left(readings: Sequence[Reading], fits: Sequence[Fit], free: FreeParameters) -> list[Remainder]:
+    """What fits leave in all rows of readings."""
+    return remainders([one.problem for one in readings], [one.cameras for one in readings], fits, free)
+
+
+def _of_first_rows(
     one: Reading,
     start: tuple[Array, Array, Array],
     free: FreeParameters,
@@ -168,47 +141,32 @@ def fitted(
     *,
     starts: int = 0,
     hopeless: float = np.inf,
-) -> Fitted:
-    """The optimum under an alternative, or where part of the rows lead if that leaves a hopeless chi2 in all rows.
-
-    starts: rotations that are tried where the closed form leads nowhere.
-    """
-    problem, weight = one.problem, one.weight
+) -> Fit:
+    """The optimum of the rows that a reading is fitted to first; `starts` and `hopeless` as of `fitted`."""
+    problem, rows = one.problem, one.first
     enough = np.inf if one.whole else SCANNER_GAIN * hopeless * len(one.rows) / len(problem)
     last = STEP_TOLERANCE if one.whole else PASSING
-    fit = minimise(problem, held, start, weight=weight, iterations=ITERATIONS, tolerance=PASSING if len(free) else last)
+    fit = minimise(problem, held, start, rows=rows, iterations=ITERATIONS, tolerance=PASSING if len(free) else last)
     if not np.isfinite(fit.chi2):
         fit = _from_elsewhere(one, start, held, starts)
     if len(free) and fit.chi2 < enough:
-        fit = minimise(problem, free, fit, weight=weight, iterations=ITERATIONS, tolerance=last)
-    if len(fit.delta) != len(free):
-        fit = replace(fit, delta=np.zeros(len(free)))
-    r = residuals(problem, free, fit)
-    d2 = whitened2(problem, r)
-    if one.whole:
-        return Fitted(fit=fit, r=r, d2=d2)
-    chi2 = float(d2.sum() + (free.information * fit.delta**2).sum())
-    if not chi2 < hopeless:
-        # a ball behind the source in any row makes the reading impossible
-        return Fitted(fit=replace(fit, chi2=chi2 if np.isfinite(chi2) else np.inf), r=r, d2=d2)
-    fit = minimise(problem, free, fit, iterations=ITERATIONS)
-    r = residuals(problem, free, fit)
-    return Fitted(fit=fit, r=r, d2=whitened2(problem, r))
+        fit = minimise(problem, free, fit, rows=rows, iterations=ITERATIONS, tolerance=last)
+    return fit if len(fit.delta) == len(free) else replace(fit, delta=np.zeros(len(free)))
 
 
 def _from_elsewhere(one: Reading, start: tuple[Array, Array, Array], held: FreeParameters, starts: int) -> Fit:
     """The optimum from half a turn about the beam, or from the best of some rotations."""
-    problem, weight = one.problem, one.weight
+    problem, rows = one.problem, one.first
     turned = turned_about_beam(problem, start[0], one.rays, one.rows)
-    fit = minimise(problem, held, turned, weight=weight, iterations=ITERATIONS)
+    fit = minimise(problem, held, turned, rows=rows, iterations=ITERATIONS)
     if np.isfinite(fit.chi2):
         return fit
     # mirrored data have no closed form in front of the source; the residual they leave is still worth knowing
     others = (
-        minimise(problem, held, other, weight=weight, iterations=ITERATIONS)
+        minimise(problem, held, other, rows=rows, iterations=ITERATIONS)
         for other in itertools.islice(other_starts(problem, one.rays), starts)
     )
-    return minimise(problem, held, min((fit, *others), key=lambda one: one.chi2), weight=weight)
+    return minimise(problem, held, min((fit, *others), key=lambda one: one.chi2), rows=rows)
 
 
 def optimum_under(problem: Problem, free: FreeParameters) -> Fit:
@@ -217,4 +175,4 @@ def optimum_under(problem: Problem, free: FreeParameters) -> Fit:
     rays = ray_equations(problem, cameras)
     one = Reading(problem=problem, cameras=cameras, rays=rays, rows=np.arange(len(problem)))
     held = free_parameters(problem.scanners, fix=tuple(UNITS))
-    return fitted(one, linear_starts([one])[0], free, held).fit
+    return _of_first_rows(one, linear_starts([one])[0], free, held)
