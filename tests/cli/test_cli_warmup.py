@@ -7,9 +7,11 @@ import multiprocessing
 import time
 
 import numba
+import numba.core.event
 import pytest
 
 from tomopose import kernel_cache
+from tomopose.cli import common
 from tomopose.cli.common import Say
 from tomopose.cli.main import run
 from tomopose.studies import warmup
@@ -108,6 +110,17 @@ def test_progress_says_compiling_once_where_lines_are_plain(capsys):
         progress(2, 2)
     lines = capsys.readouterr().err.splitlines()
     assert [line.split(":")[1].split()[0] for line in lines] == ["0", "compiling", "2"]
+
+
+def test_time_left_is_that_of_the_work_and_not_of_the_compiling(monkeypatch, capsys):
+    now = 0.0
+    monkeypatch.setattr(common.time, "monotonic", lambda: now)
+    with Say().progress("detecting") as progress:
+        with numba.core.event.trigger_event("numba:compile"):
+            now = 60.0
+        now = 62.0
+        progress(1, 11)
+    assert capsys.readouterr().err.splitlines()[-1] == "detecting: 1 of 11, 20 s left"
 
 
 @pytest.mark.slow

@@ -142,11 +142,15 @@ def _bar(label: str) -> Iterator[Progress]:
 def _lines(label: str) -> Iterator[Progress]:
     from tomopose.kernel_cache import reporting_compiling
 
-    start = time.monotonic()
-    said, told = -1, False
+    start = time.monotonic()  # later by what was spent on compiling, which the remaining work does not repeat
+    said, told, began = -1, False, 0.0
 
     def compiling(now: bool) -> None:
-        nonlocal told
+        nonlocal told, start, began
+        if now:
+            began = time.monotonic()
+        else:
+            start += time.monotonic() - began
         if not told:
             told = True
             tell(f"{label}: compiling what this command needs, once for this installation")
