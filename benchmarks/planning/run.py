@@ -76,8 +76,8 @@ def within(task: Setting, plan: PartScanPlan) -> bool:
 def worth_table(views: int, parts: list[str]) -> None:
     print(f"{views} views; J on points that nothing was planned with")
     print(
-        f"{'part':<10}{'certificate':>12}{'plan':>8}{'circular':>10}{'triangle':>10}{'sine':>8}{'random':>8}{'gain':>8}"
-        f"{'over one':>10}"
+        f"{'part':<10}{'certificate':>12}{'plan':>8}{'circular':>10}{'triangle':>10}{'sine':>8}{'of ten':>8}"
+        f"{'over ten':>10}{'gain':>10}"
         f"{'allowed':>9}{'worst tau / circular':>22}{'s CPU':>7}"
     )
     for name in parts:
@@ -86,13 +86,13 @@ def worth_table(views: int, parts: list[str]) -> None:
         seconds = time.process_time() - start
         drawn = random_J(task, plan)
         others = {k: j.worth.J for k, j in plan.paths.items()} | {"random": max(drawn)}
-        over_one = plan.chosen.worth.J / max(*(j.worth.J for j in plan.paths.values()), float(np.mean(drawn))) - 1
-        gain = plan.chosen.worth.J / max(others.values()) - 1
+        gain = plan.chosen.worth.J / max(*(j.worth.J for j in plan.paths.values()), float(np.mean(drawn))) - 1
+        over_ten = plan.chosen.worth.J / max(others.values()) - 1
         tau = plan.chosen.tau.min() / plan.paths["circular"].tau.min()
         print(
             f"{name:<10}{plan.planned_J / plan.bound:12.4f}{plan.chosen.worth.J:8.3f}{others['circular']:10.3f}"
-            f"{others['triangle']:10.3f}{others['sine']:8.3f}{others['random']:8.3f}{100 * gain:6.0f} %"
-            f"{100 * over_one:8.0f} %{'all' if within(task, plan) else 'NO':>9}{tau:22.2f}{seconds:7.0f}",
+            f"{others['triangle']:10.3f}{others['sine']:8.3f}{others['random']:8.3f}{100 * over_ten:8.1f} %"
+            f"{100 * gain:8.1f} %{'all' if within(task, plan) else 'NO':>9}{tau:22.2f}{seconds:7.0f}",
             flush=True,
         )
 
@@ -109,7 +109,7 @@ def large() -> None:
         mesh = mesh.refined()
     part = Part(mesh=Mesh(points=mesh.vertices, faces=np.asarray(mesh.faces)), name="fine specimen")
     task = setting(replace(case, part=part), 100)
-    coarse = replace(task, settings=replace(task.settings, alpha_step=math.radians(18), tilt_step=math.radians(8)))
+    coarse = replace(task, settings=replace(task.settings, alpha_step=math.radians(8), tilt_step=math.radians(8)))
     start, wall = time.process_time(), time.perf_counter()
     plan = plan_part_scan(coarse)
     print(
