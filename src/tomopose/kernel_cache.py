@@ -7,13 +7,16 @@ read-only file system, or for a service without a home.
 from __future__ import annotations
 
 import contextlib
+import functools
+import gc
 import os
 import stat
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 VARIABLE = "NUMBA_CACHE_DIR"
 """numba's own: a folder that the user names in it is used wherever it can be written."""
@@ -89,6 +92,55 @@ def compile_each_time() -> None:
     from numba.core.dispatcher import Dispatcher
 
     setattr(Dispatcher, "enable_caching", lambda self: None)  # noqa: B010  (a method is replaced)
+
+
+if TYPE_CHECKING:
+    from numba import njit
+else:
+
+    def njit(**options):
+        """`numba.njit` as every kernel here uses it: without the wrapper by which C would call the kernel, and compiled
+        while the garbage collector rests.
+        """
+        import numba
+
+        _let_collector_rest()
+        return numba.njit(no_cfunc_wrapper=True, **options)
+
+
+@functools.cache
+def _let_collector_rest() -> None:
+    """No garbage collection from the start of the outermost compilation to its end, in whichever threads they are.
+
+    A compilation makes some hundred thousand objects beside all that scipy and numba hold.  The collector would go
+    through them again and again and find little to free.
+    """
+    from numba.core import event as untyped_event
+    from numba.core.event import Event, Listener
+
+    events: Any = untyped_event
+
+    class CollectorRests(Listener):
+        """Kernels that call others are compiled one inside the other: the outermost counts."""
+
+        depth = 0
+        was_on = False
+        lock = threading.Lock()
+
+        def on_start(self, event: Event) -> None:
+            with self.lock:
+                if self.depth == 0:
+                    self.was_on = gc.isenabled()
+                    gc.disable()
+                self.depth += 1
+
+        def on_end(self, event: Event) -> None:
+            with self.lock:
+                self.depth -= 1
+                if self.depth == 0 and self.was_on:
+                    gc.enable()
+
+    events.register("numba:compile", CollectorRests())
 
 
 @contextlib.contextmanager

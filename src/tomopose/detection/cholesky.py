@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from tomopose.errors import BallNotFoundError
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 RIDGE = 1e-12

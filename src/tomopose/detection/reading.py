@@ -7,10 +7,10 @@ from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from tomopose.errors import BallNotFoundError, InputError, ShapeError
 from tomopose.geometry.scanner import Scanner
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 NATIVE = ("uint8", "uint16", "float32", "float64")

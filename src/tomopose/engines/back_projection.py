@@ -12,10 +12,10 @@ import math
 from typing import TypeAlias
 
 import numpy as np
-from numba import njit
 
 from tomopose.engines.layout import BORDER, F32, MARGIN, TILE, Lookup, Support, clip_range, whole_between
 from tomopose.engines.vector import BLOCKS, W, back_blocks, back_blocks_inverse_square
+from tomopose.kernel_cache import njit
 
 Line: TypeAlias = tuple[float, float, float, float, float, float]
 """a_u, b_u, a_v, b_v, a_w, b_w of `column_image`."""

@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from tomopose.engines.layout import F32, MARGIN, Rays, Work, clip_range, whole_between
 from tomopose.engines.vector import W, forward_block
+from tomopose.kernel_cache import njit
 
 
 @njit(cache=True, nogil=True)

@@ -19,7 +19,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from tomopose.kernel_cache import njit
 
 MARGIN = 3
 BORDER = 2

@@ -11,10 +11,10 @@ met once like one that is met often, knows neither noise nor absorption, and tak
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError, ShapeError
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 from tomopose.values import require_types, value
 

@@ -18,12 +18,12 @@ from operator import attrgetter
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from tomopose.geometry.rotations import skew
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 Compiled = TypeVar("Compiled", bound=Callable[..., object])
@@ -61,7 +61,6 @@ _UNCALLED: dict[str, Any] = {
     "cache": True,
     "error_model": "numpy",
     "no_cpython_wrapper": True,
-    "no_cfunc_wrapper": True,
 }
 
 

@@ -11,7 +11,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numba.extending import register_jitable
 
 from tomopose.calibration.model.ball_projection import (
@@ -28,6 +28,7 @@ from tomopose.calibration.model.ball_projection import (
     project_pose,
     view_of,
 )
+from tomopose.kernel_cache import njit
 from tomopose.least_squares import CODES
 from tomopose.units import Array
 

@@ -22,12 +22,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from tomopose.calibration.model.ball_projection import ProjectionBlocks
 from tomopose.calibration.model.tall import ByBall
 from tomopose.calibration.rigid.kernel import TOGETHER, add_products, take_row
 from tomopose.geometry.rotations import skew
+from tomopose.kernel_cache import njit
 from tomopose.manipulator.real_poses import Repeatability
 from tomopose.units import Array
 

@@ -7,9 +7,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from tomopose.detection.order_statistics import median
+from tomopose.kernel_cache import njit
 
 RAYS = 72
 COS, SIN = np.cos(2 * np.pi * np.arange(RAYS) / RAYS), np.sin(2 * np.pi * np.arange(RAYS) / RAYS)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 SMALLEST, LARGEST = 3.4, 14.5

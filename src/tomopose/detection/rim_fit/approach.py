@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numba import njit
 
 from tomopose.coverage import MAD_TO_SIGMA
 from tomopose.detection.order_statistics import median
@@ -15,6 +14,7 @@ from tomopose.detection.rim_fit.steps import equal_weight, stepped, with_equal_w
 from tomopose.detection.rim_model.ring import SHELLS, BallWindow, Ring, taken_pixels, whole_ring
 from tomopose.detection.settings import DetectionSettings
 from tomopose.errors import BallNotFoundError
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 TURNS, NEAR_ENOUGH = 14, 0.02

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy.ndimage import convolve
 
 from tomopose.coverage import NORMAL_MEDIAN
@@ -16,6 +15,7 @@ from tomopose.detection.rim_fit.state import Noise, RimFit
 from tomopose.detection.rim_model.ring import SHELLS
 from tomopose.detection.settings import NoiseSettings
 from tomopose.errors import BallNotFoundError
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 SHORT = 0.139

@@ -9,11 +9,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from tomopose.detection.rim_fit.state import Indices, RimFit, Unknowns, active_parameters, jacobian_rows
 from tomopose.detection.rim_model.ring import SHELLS
 from tomopose.detection.rim_model.rows import FIRST_NODE, KAPPA, LOCAL, WHITE
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 

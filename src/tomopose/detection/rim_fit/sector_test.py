@@ -18,7 +18,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numba import njit
 
 from tomopose.detection.cholesky import solve
 from tomopose.detection.order_statistics import select
@@ -26,6 +25,7 @@ from tomopose.detection.rim_fit.noise import excess_variance
 from tomopose.detection.rim_fit.normal_equations import Equations, summed, with_priors
 from tomopose.detection.rim_fit.state import RimFit, active_parameters
 from tomopose.detection.rim_model.rows import FIRST_NODE
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 

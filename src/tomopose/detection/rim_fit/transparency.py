@@ -6,12 +6,12 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numba import njit
 
 from tomopose.detection.order_statistics import median
 from tomopose.detection.rim_fit.state import Parameters, RimFit, Unknowns
 from tomopose.detection.rim_fit.steps import stepped, with_equal_weights
 from tomopose.detection.rim_model.ring import annulus_pixels
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 FEWEST = 5

@@ -15,10 +15,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from tomopose.geometry.scanner import Scanner
 from tomopose.geometry.silhouette import principal_axes, silhouette_ellipse
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 

@@ -24,8 +24,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 STRAIGHT, COLUMNS = 5, 11

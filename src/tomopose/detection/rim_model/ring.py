@@ -12,12 +12,12 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from tomopose.detection.rim_model.cone import cone_angle, cone_coordinates, cone_eccentricity, direction_angle
 from tomopose.detection.settings import RingSettings
 from tomopose.errors import BallNotFoundError
 from tomopose.geometry.scanner import Scanner
+from tomopose.kernel_cache import njit
 from tomopose.units import Array, float_array
 
 Good: TypeAlias = npt.NDArray[np.bool_]

@@ -13,10 +13,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from tomopose.detection.rim_model.edge_profile import STRAIGHT
 from tomopose.detection.rim_model.ring import SHELLS
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 SHAPE = ("u", "v", "radius", "sigma", "kappa", "q_cos", "q_sin")

@@ -10,8 +10,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 LEAF = 6

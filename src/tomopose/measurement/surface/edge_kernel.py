@@ -12,8 +12,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from tomopose.kernel_cache import njit
 from tomopose.measurement.surface.splines import spline_value
 from tomopose.units import Array
 

@@ -15,9 +15,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from tomopose.coverage import MAD_TO_SIGMA
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 ONE_SIDED = 0.15

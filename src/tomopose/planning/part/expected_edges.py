@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numba import njit
 from scipy.special import erfc
 
+from tomopose.kernel_cache import njit
 from tomopose.measurement.surface import edge_kernel as kernel
 from tomopose.measurement.surface.edges import EdgeSettings, common_sigma, fit_window
 from tomopose.units import Array

@@ -13,8 +13,8 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 MOST_CELLS = 256

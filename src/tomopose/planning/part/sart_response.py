@@ -28,7 +28,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy import fft
 from scipy.ndimage import gaussian_filter
 from scipy.sparse import csr_array
@@ -36,6 +35,7 @@ from scipy.sparse import csr_array
 from tomopose.engines.cpu import processors
 from tomopose.geometry.projection import project
 from tomopose.geometry.scanner import Scanner
+from tomopose.kernel_cache import njit
 from tomopose.planning.part.material_paths import material_paths
 from tomopose.planning.part.part import Part
 from tomopose.planning.part.settings import PartSettings

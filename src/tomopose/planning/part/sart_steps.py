@@ -20,7 +20,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy.sparse import csr_array
 
 from tomopose.engines.cpu import CpuEngine, processors
@@ -28,6 +27,7 @@ from tomopose.engines.geometry import per_length
 from tomopose.geometry.box import BOX_CORNERS
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.geometry.scanner import Scanner
+from tomopose.kernel_cache import njit
 from tomopose.measurement.surface.splines import spline_coefficients, spline_value
 from tomopose.planning.part.part import Part
 from tomopose.planning.part.sart_response import RELAXATION, blocks

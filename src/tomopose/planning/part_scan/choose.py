@@ -15,8 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 SWEEPS = 4

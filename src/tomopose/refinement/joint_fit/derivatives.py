@@ -13,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from tomopose.engines.cpu import RAY_COLUMNS
 from tomopose.engines.forward_projection import (
@@ -30,6 +29,7 @@ from tomopose.engines.geometry import index_geometry
 from tomopose.engines.layout import F32, Rays
 from tomopose.engines.vector import W, derivative_block
 from tomopose.geometry.projection import ProjectionMatrices
+from tomopose.kernel_cache import njit
 from tomopose.units import Floats
 from tomopose.volume import VoxelGrid
 

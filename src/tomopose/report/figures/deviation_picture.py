@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from tomopose.errors import ShapeError
+from tomopose.kernel_cache import njit
 from tomopose.measurement.mesh.colours import vik
 from tomopose.report.figures.png import colour_png, data_uri
 from tomopose.report.page import Figure

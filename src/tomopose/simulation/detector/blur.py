@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from scipy.special import ndtr
 
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 REACH = 5.0

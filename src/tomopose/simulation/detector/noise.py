@@ -10,7 +10,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from tomopose.kernel_cache import njit
 
 FEW = 60.0
 """Below this mean a Poisson number is drawn exactly; above it the normal approximation with skewness is used."""

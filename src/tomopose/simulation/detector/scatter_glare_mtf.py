@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from scipy import fft, ndimage
 
 from tomopose.errors import InputError
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 

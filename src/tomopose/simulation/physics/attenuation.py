@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 OPAQUE = 30.0

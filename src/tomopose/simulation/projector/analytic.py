@@ -14,11 +14,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.kernel_cache import njit
 from tomopose.simulation.physics.spectrum import Beam
 from tomopose.simulation.projector.cells import (
     HELD,

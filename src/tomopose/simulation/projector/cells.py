@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 HELD = 6

@@ -9,7 +9,8 @@ from __future__ import annotations
 from typing import Any, cast
 
 import numpy as np
-from numba import njit
+
+from tomopose.kernel_cache import njit
 
 FAR = 1.0e12
 """Where a crossing lies that a half-space or an unbounded slab does not have, mm."""
@@ -126,10 +127,7 @@ def _torus(
 
 @njit(cache=True, nogil=True)
 def crossings(
-    kind: np.ndarray,
-    p: np.ndarray,
-    R: np.ndarray,
-    c: np.ndarray,
+    primitives: np.ndarray,
     q: int,
     o: tuple[float, float, float],
     d: tuple[float, float, float],
@@ -137,34 +135,38 @@ def crossings(
     S: np.ndarray,
     row: int,
 ) -> int:
-    """Crossings of primitive q with the ray o + t d: into row `row` of T (distances) and S (faces); how many (even)."""
+    """Crossings of primitive q with the ray o + t d: into row `row` of T (distances) and S (faces); how many (even).
+
+    primitives (n, 16): numbers p (3), place t (3), directions R (9, by rows) and kind.
+    """
     # The ray's origin moves to the point nearest to the primitive's own origin; `shift` brings distances back.
+    at = primitives[q]
     dx, dy, dz = d
-    ex, ey, ez = o[0] - c[q, 0], o[1] - c[q, 1], o[2] - c[q, 2]
+    ex, ey, ez = o[0] - at[3], o[1] - at[4], o[2] - at[5]
     shift = -(ex * dx + ey * dy + ez * dz)
     ex, ey, ez = ex + shift * dx, ey + shift * dy, ez + shift * dz
     n = 0
-    what, a, b = kind[q], p[q, 0], p[q, 1]
+    what, a, b = int(at[15]), at[0], at[1]
     if what == 0:
         inside = a * a - (ex * ex + ey * ey + ez * ez)
         if inside > 0:
             half = np.sqrt(inside)
             n = _put(T, S, row, -half, half, 0, 0)
     else:
-        lx = R[q, 0, 0] * ex + R[q, 1, 0] * ey + R[q, 2, 0] * ez
-        ly = R[q, 0, 1] * ex + R[q, 1, 1] * ey + R[q, 2, 1] * ez
-        lz = R[q, 0, 2] * ex + R[q, 1, 2] * ey + R[q, 2, 2] * ez
-        gx = R[q, 0, 0] * dx + R[q, 1, 0] * dy + R[q, 2, 0] * dz
-        gy = R[q, 0, 1] * dx + R[q, 1, 1] * dy + R[q, 2, 1] * dz
-        gz = R[q, 0, 2] * dx + R[q, 1, 2] * dy + R[q, 2, 2] * dz
+        lx = at[6] * ex + at[9] * ey + at[12] * ez
+        ly = at[7] * ex + at[10] * ey + at[13] * ez
+        lz = at[8] * ex + at[11] * ey + at[14] * ez
+        gx = at[6] * dx + at[9] * dy + at[12] * dz
+        gy = at[7] * dx + at[10] * dy + at[13] * dz
+        gz = at[8] * dx + at[11] * dy + at[14] * dz
         if what == 1:
             n = _cylinder(lx, ly, lz, gx, gy, gz, a, b, T, S, row)
         elif what == 2:
-            n = _cone(lx, ly, lz, gx, gy, gz, a, b, p[q, 2], T, S, row)
+            n = _cone(lx, ly, lz, gx, gy, gz, a, b, at[2], T, S, row)
         elif what == 3:
             lo, hi, s_lo, s_hi = _slab(lx, gx, a, FACE_1, -FAR, FAR, SIDE, SIDE)
             lo, hi, s_lo, s_hi = _slab(ly, gy, b, FACE_3, lo, hi, s_lo, s_hi)
-            lo, hi, s_lo, s_hi = _slab(lz, gz, p[q, 2], FACE_5, lo, hi, s_lo, s_hi)
+            lo, hi, s_lo, s_hi = _slab(lz, gz, at[2], FACE_5, lo, hi, s_lo, s_hi)
             n = _put(T, S, row, lo, hi, s_lo, s_hi)
         elif what == 4:
             if ex * ex + ey * ey + ez * ez < (a + b) ** 2:

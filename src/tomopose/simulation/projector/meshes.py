@@ -9,11 +9,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.kernel_cache import njit
 from tomopose.simulation.objects.mesh import MeshSolid
 from tomopose.simulation.physics.attenuation import attenuated
 from tomopose.simulation.physics.spectrum import Beam
@@ -42,9 +42,10 @@ on the second and the third lattice are used."""
 @njit(cache=True, nogil=True, inline="always")
 def _reach(c: KernelScene, u: float, v: float) -> float:
     """Length (mm) of u U + v V + O - s: what one unit of q is worth."""
-    x = c.O[0] + u * c.U[0] + v * c.V[0] - c.s[0]
-    y = c.O[1] + u * c.U[1] + v * c.V[1] - c.s[1]
-    z = c.O[2] + u * c.U[2] + v * c.V[2] - c.s[2]
+    eye = c.eye
+    x = eye[1, 0] + u * eye[2, 0] + v * eye[3, 0] - eye[0, 0]
+    y = eye[1, 1] + u * eye[2, 1] + v * eye[3, 1] - eye[0, 1]
+    z = eye[1, 2] + u * eye[2, 2] + v * eye[3, 2] - eye[0, 2]
     return float(np.sqrt(x * x + y * y + z * z))
 
 

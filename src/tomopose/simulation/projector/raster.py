@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from tomopose.errors import OutOfViewError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.kernel_cache import njit
 from tomopose.simulation.objects.mesh import MeshSolid, TriangleMesh
 from tomopose.simulation.projector.view import Arrays, View, Window, in_bands
 from tomopose.units import Array

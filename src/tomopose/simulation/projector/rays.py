@@ -12,12 +12,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from tomopose.errors import InputError
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.kernel_cache import njit
 from tomopose.simulation.objects.shapes import Joined, Primitive, Shape, Solid
 from tomopose.simulation.projector.crossings import crossings
 from tomopose.simulation.projector.view import in_bands
@@ -34,17 +34,16 @@ with; these are values like any other."""
 
 
 class SolidArrays(NamedTuple):
-    """The arrays of `Compiled`, in one frame, as numba takes them."""
+    """`Compiled` in one frame, in few arrays: each array that goes from kernel to kernel costs compile time.
 
-    kind: np.ndarray
-    p: Array
-    R: Array
-    t: Array
+    primitives (n, 16): p, t, R by rows and kind; ops: as in `Compiled`; runs (m, 3): first op of each solid, the one
+    after its last, its material; spheres (m, 4): centre and radius.
+    """
+
+    primitives: Array
     ops: np.ndarray
-    first: np.ndarray
-    material: np.ndarray
-    centre: Array
-    radius: Array
+    runs: np.ndarray
+    spheres: Array
 
 
 @value
@@ -78,9 +77,11 @@ class Compiled:
         """What the kernels take, in W, or in the frame that all solids share where T_FW is None."""
         R, t, centre = (self.R, self.t, self.centre) if T_FW is None else self.in_world(T_FW)
         return SolidArrays(
-            kind=self.kind, p=self.p, R=R, t=t, ops=self.ops, first=self.first, material=self.material, centre=centre,
-            radius=self.radius,
-        )  # fmt: skip
+            primitives=np.column_stack([self.p, t, R.reshape(-1, 9), self.kind]),
+            ops=self.ops,
+            runs=np.stack([self.first[:-1], self.first[1:], self.material], axis=1),
+            spheres=np.column_stack([centre, self.radius]),
+        )
 
     def in_world(self, T_FW: dict[Frame, RigidTransform]) -> tuple[Array, Array, Array]:
         """(R, t, centre) of primitives and bounding spheres in W, for one pose's frame-to-world transforms."""
@@ -185,10 +186,10 @@ def _solid_crossings(
     """Crossings of solid k, by its postfix program, into row 0 of T and S; their number, -1 where a list overflowed."""
     spare = T.shape[0] - 1
     top = n_now = ROW_0
-    for q in range(s.first[k], s.first[k + 1]):
+    for q in range(s.runs[k, 0], s.runs[k, 1]):
         op = s.ops[q]
         if op >= 0:
-            n_now = crossings(s.kind, s.p, s.R, s.t, op, (ox, oy, oz), (dx, dy, dz), T, S, top)
+            n_now = crossings(s.primitives, op, (ox, oy, oz), (dx, dy, dz), T, S, top)
             S[top, LARGEST] = n_now
             top += 1
             continue
@@ -216,9 +217,9 @@ def _solid_crossings(
 @njit(cache=True, nogil=True, inline="always")
 def _misses(s: SolidArrays, k: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> bool:
     """Whether a ray passes the bounding sphere of solid k."""
-    ex, ey, ez = s.centre[k, 0] - ox, s.centre[k, 1] - oy, s.centre[k, 2] - oz
+    ex, ey, ez = s.spheres[k, 0] - ox, s.spheres[k, 1] - oy, s.spheres[k, 2] - oz
     along = ex * dx + ey * dy + ez * dz
-    result: bool = ex * ex + ey * ey + ez * ez - along * along >= s.radius[k] * s.radius[k] * (1 + 1e-9) + 1e-9
+    result: bool = ex * ex + ey * ey + ez * ez - along * along >= s.spheres[k, 3] * s.spheres[k, 3] * (1 + 1e-9) + 1e-9
     return result
 
 
@@ -249,7 +250,7 @@ def trace(
     met = 0
     taken, other, n_taken = T.shape[0] - 2, T.shape[0] - 3, ROW_0
     # Later solids displace earlier ones: walk backwards and keep what is taken already.
-    for k in range(len(s.first) - 2, -1, -1):
+    for k in range(len(s.runs) - 1, -1, -1):
         if not active[k] or _misses(s, k, ox, oy, oz, dx, dy, dz):
             continue
         n_now = _solid_crossings(s, k, ox, oy, oz, dx, dy, dz, T, S)
@@ -268,7 +269,7 @@ def trace(
             path += max(T[row, e + 1], 0.0) - max(T[row, e], 0.0)
         for e in range(n_row):
             signature = (signature * np.int64(1000003) + S[row, e] + 1) & np.int64(0x7FFFFFFFFFFF)
-        L[s.material[k]] += path
+        L[s.runs[k, 2]] += path
         if k > 0:
             n_taken = _combine(T, S, ROW_0, n_now, taken, n_taken, UNION, other)
             if n_taken < 0:
@@ -279,7 +280,7 @@ def trace(
 
 
 @njit(cache=True, nogil=True)
-def _meet(centre: np.ndarray, radius: np.ndarray, o: np.ndarray, d: np.ndarray, active: np.ndarray) -> None:
+def _meet(spheres: np.ndarray, o: np.ndarray, d: np.ndarray, active: np.ndarray) -> None:
     """Mark the solids that a bundle of rays can meet.
 
     Rays within the angle a of an axis pass a point at distance e from their origin, p from the axis, no nearer than
@@ -299,20 +300,20 @@ def _meet(centre: np.ndarray, radius: np.ndarray, o: np.ndarray, d: np.ndarray, 
     for i in range(len(d)):
         cosine = min(cosine, x * d[i, 0] + y * d[i, 1] + z * d[i, 2])
     sine = np.sqrt(max(1 - cosine * cosine, 0.0)) + 1e-9
-    for k in range(len(centre)):
-        ex, ey, ez = centre[k, 0] - o[0, 0], centre[k, 1] - o[0, 1], centre[k, 2] - o[0, 2]
+    for k in range(len(spheres)):
+        ex, ey, ez = spheres[k, 0] - o[0, 0], spheres[k, 1] - o[0, 1], spheres[k, 2] - o[0, 2]
         along, square = ex * x + ey * y + ez * z, ex * ex + ey * ey + ez * ez
-        active[k] = np.sqrt(max(square - along * along, 0.0)) * cosine - np.sqrt(square) * sine <= radius[k] + 1e-6
+        active[k] = np.sqrt(max(square - along * along, 0.0)) * cosine - np.sqrt(square) * sine <= spheres[k, 3] + 1e-6
 
 
 @njit(cache=True, nogil=True)
 def _trace_all(s: SolidArrays, o: np.ndarray, d: np.ndarray, depth: int, lo: int, hi: int, L: np.ndarray) -> int:
     """Path lengths of rays lo to hi into L; returns the number of a ray whose list overflowed, or -1."""
     T, S = np.empty((depth + 3, LARGEST)), np.empty((depth + 3, LARGEST + 1), dtype=np.int64)
-    active = np.ones(len(s.material), dtype=np.bool_)
+    active = np.ones(len(s.runs), dtype=np.bool_)
     for i in range(lo, hi):
         if (i - lo) % BUNDLE == 0:
-            _meet(s.centre, s.radius, o[i : min(i + BUNDLE, hi)], d[i : min(i + BUNDLE, hi)], active)
+            _meet(s.spheres, o[i : min(i + BUNDLE, hi)], d[i : min(i + BUNDLE, hi)], active)
         if trace(s, active, o[i, 0], o[i, 1], o[i, 2], d[i, 0], d[i, 1], d[i, 2], T, S, L[i]) < 0:
             return i
     return -1

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.kernel_cache import njit
 from tomopose.simulation.physics.attenuation import attenuated
 from tomopose.simulation.physics.spectrum import Beam
 from tomopose.simulation.projector.rays import LARGEST, Compiled, SolidArrays, trace
@@ -23,15 +23,15 @@ EVEN = 5e-4
 
 
 class KernelScene(NamedTuple):
-    """What the kernels take of a scene's solids (or of none), its beam and its view: source s (3,), pixel (0, 0) at O,
-    steps U and V, all in W, mm; boxes (m, 2, 2): shadows of the solids on the panel, px."""
+    """What the kernels take of a scene's solids (or of none), its beam and its view.
+
+    eye (4, 3): source s, middle O of pixel (0, 0), steps U and V, all in W, mm: one array, since each costs compile
+    time.  boxes (m, 2, 2): shadows of the solids on the panel, px.
+    """
 
     solids: SolidArrays
     beam: Arrays
-    s: Array
-    O: Array
-    U: Array
-    V: Array
+    eye: Array
     boxes: Array
 
 
@@ -45,9 +45,8 @@ class WorkSpace(NamedTuple):
 
 
 NO_SOLIDS = SolidArrays(
-    kind=np.empty(0, dtype=np.int64), p=np.empty((0, 3)), R=np.empty((0, 3, 3)), t=np.empty((0, 3)),
-    ops=np.empty(0, dtype=np.int64), first=np.zeros(1, dtype=np.int64), material=np.empty(0, dtype=np.int64),
-    centre=np.empty((0, 3)), radius=np.empty(0),
+    primitives=np.empty((0, 16)), ops=np.empty(0, dtype=np.int64), runs=np.empty((0, 3), dtype=np.int64),
+    spheres=np.empty((0, 4)),
 )  # fmt: skip
 
 
@@ -58,7 +57,9 @@ def kernel_scene(compiled: Compiled | None, beam: Beam, view: View, T_FW: dict[F
     else:
         solids = compiled.arrays(T_FW)
         boxes = shadow_boxes(list(zip(compiled.frame, compiled.corners, strict=True)), view, T_FW)
-    return KernelScene(solids=solids, beam=beam.arrays, s=view.source, O=view.O, U=view.U, V=view.V, boxes=boxes)
+    return KernelScene(
+        solids=solids, beam=beam.arrays, eye=np.stack([view.source, view.O, view.U, view.V]), boxes=boxes
+    )
 
 
 @register_jitable
@@ -83,11 +84,13 @@ def lengths(c: KernelScene, work: WorkSpace, u: float, v: float) -> Any:
     if nothing:
         work.L[:] = 0.0
         return np.int64(0)
-    dx = c.O[0] + u * c.U[0] + v * c.V[0] - c.s[0]
-    dy = c.O[1] + u * c.U[1] + v * c.V[1] - c.s[1]
-    dz = c.O[2] + u * c.U[2] + v * c.V[2] - c.s[2]
+    eye = c.eye
+    dx = eye[1, 0] + u * eye[2, 0] + v * eye[3, 0] - eye[0, 0]
+    dy = eye[1, 1] + u * eye[2, 1] + v * eye[3, 1] - eye[0, 1]
+    dz = eye[1, 2] + u * eye[2, 2] + v * eye[3, 2] - eye[0, 2]
     h = 1 / np.sqrt(dx * dx + dy * dy + dz * dz)
-    return trace(c.solids, work.active, c.s[0], c.s[1], c.s[2], h * dx, h * dy, h * dz, work.T, work.S, work.L)
+    s_x, s_y, s_z = eye[0, 0], eye[0, 1], eye[0, 2]
+    return trace(c.solids, work.active, s_x, s_y, s_z, h * dx, h * dy, h * dz, work.T, work.S, work.L)
 
 
 @njit(cache=True, nogil=True)

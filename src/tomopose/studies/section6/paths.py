@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from tomopose.geometry.frames import Frame
 from tomopose.geometry.transforms import RigidTransform
+from tomopose.kernel_cache import njit
 from tomopose.simulation.objects.mesh import MeshSolid
 from tomopose.simulation.projector.raster import mesh_path_image
 from tomopose.simulation.projector.view import View, Window

@@ -16,13 +16,13 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from tomopose.calibration.model.ball_projection import ProjectionBlocks, inner
 from tomopose.calibration.model.parameters import FreeParameters
 from tomopose.calibration.model.problem import Problem
 from tomopose.calibration.model.tall import Table, WhiteRows, is_tall, lengths, parts, times, transposed_times, triangle
 from tomopose.calibration.rigid.fit import Fit, derivatives, linearised
+from tomopose.kernel_cache import njit
 from tomopose.units import Array
 
 SEEN = 1e-6
