@@ -11,6 +11,7 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 
+from tomopose import BallObservations, PoseSequence
 from tomopose.calibration.model.budget import ScanBudget
 from tomopose.calibration.records.decisions import Decision
 from tomopose.calibration.result import ModelComparison, ModelJudgement
@@ -290,6 +291,40 @@ def test_observations_report_counts_and_names_what_is_lost(sample):
     assert len(figures_of(html)) == 2
     nothing = dataclasses.replace(observations, seen=np.zeros(n, dtype=bool))
     assert f"No ball was measured in any of {n} images." in observations_report(nothing)
+
+
+def test_a_report_of_very_many_images_stays_small_and_says_what_it_leaves_out(sample):
+    calibration, _, poses = sample()
+    used = calibration.pose_id
+    rows = np.tile(np.arange(len(used)), 6000 // len(used))
+    n, worst = len(rows), 4321
+    ids = tuple(f"p{k}" for k in range(n))
+    residuals = calibration.residuals[rows]
+    residuals[worst] = [0.3, 0.0]
+    many = dataclasses.replace(calibration, pose_id=ids, x_D=calibration.x_D[rows], residuals=residuals, outliers={})
+    seen = BallObservations.from_sigma(many.x_D, 0.02, pose_id=ids)
+    place = poses.index_of(used)[rows]
+    table = PoseSequence(T_MH=poses.T_MH[place], pose_id=ids, alpha=poses.alpha[place])
+    html = calibration_report(many, observations=seen, poses=table)
+    assert len(html) < 1.5e6
+    assert f"Listed are the worst 500 of {n}; calibration.json (residuals) holds all" in html
+    figures = figures_of(html)
+    assert html.count(f"Drawn are 500 of {n} poses") >= 6
+    by_pose = next(f for f in figures.values() if any(t.get("name", "").startswith("d_rms") for t in f["data"]))
+    points = [p for trace in by_pose["data"] for p in trace.get("text", [])]
+    assert len(points) == 500
+    assert ids[worst] in points
+    rms = next(t for t in by_pose["data"] if t.get("name", "").startswith("d_rms"))["y"][0]
+    np.testing.assert_allclose(rms, many.d_rms)  # of all poses, not of those drawn
+    page = observations_report(seen)
+    assert len(page) < 1.5e6
+    assert f"Drawn are 500 of {n}, evenly over the run" in page
+    assert f"Listed are those without a ball and the most uncertain 500 of {n}; observations.csv holds all" in page
+
+
+def test_a_report_of_a_usual_run_shows_every_pose(full):
+    assert "Drawn are" not in full
+    assert "Listed are" not in full
 
 
 def test_matrices_report_shows_the_source_path(scan):

@@ -170,8 +170,8 @@ class Scanner:
             return np.array(
                 [[-self.d_SD / self.p_u, 0.0, self.u_0], [0.0, self.d_SD / self.p_v, self.v_0], [0.0, 0.0, 1.0]]
             )
-        numbers = np.array([[self.d_SD], [self.p_u], [self.p_v], [self.u_0], [self.v_0]])
-        K: Array = intrinsic_matrices(*numbers, panel=self._panel_axes[None])[0]
+        d_SD, p_u, p_v, u_0, v_0 = np.array([[self.d_SD], [self.p_u], [self.p_v], [self.u_0], [self.v_0]])
+        K: Array = intrinsic_matrices(d_SD, p_u, p_v, u_0, v_0, self._panel_axes[None])[0]
         return K
 
     @property

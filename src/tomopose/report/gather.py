@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 from numpy.typing import ArrayLike
 
 from tomopose.calibration.result import Calibration
@@ -16,6 +18,10 @@ from tomopose.units import Array
 
 SMALL_ROTATION = 0.02
 """Below this share of the largest rotation of the run a component counts as not rotated (encoders never read 0)."""
+
+MOST_DRAWN, WORST_DRAWN, MOST_LISTED = 500, 100, 500
+"""Rows that a page draws at most, how many of these are the worst, and rows that one of its tables lists: a page of
+10 000 rows had 21 MB."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +44,48 @@ class Joined:
     predicted: bool
     poses: PoseSequence | None
     group: tuple[str, ...] | None
+
+    @cached_property
+    def drawn(self) -> Joined:
+        """The rows that a page draws, in their order: all, or the worst and evenly many of the others over the run."""
+        n = len(self.pose_id)
+        if n <= MOST_DRAWN:
+            return self
+        worst_first = np.argsort(-self.d, kind="stable")
+        others = np.sort(worst_first[WORST_DRAWN:])
+        k = np.sort(np.concatenate([worst_first[:WORST_DRAWN], others[evenly(len(others), MOST_DRAWN - WORST_DRAWN)]]))
+        return replace(
+            self,
+            pose_id=tuple(self.pose_id[i] for i in k),
+            number=self.number[k],
+            x_D=self.x_D[k],
+            r=self.r[k],
+            d=self.d[k],
+            z=self.z[k],
+            poses=None if self.poses is None else self.poses.select(k),
+            group=None if self.group is None else tuple(self.group[i] for i in k),
+        )
+
+    @property
+    def drawn_words(self) -> str:
+        """Says which rows are drawn, after a figure's own words; "" where all are."""
+        n, drawn = len(self.pose_id), len(self.drawn.pose_id)
+        if drawn == n:
+            return ""
+        return (
+            f" Drawn are {drawn} of {n} poses: the {WORST_DRAWN} with the largest residuals, and evenly many of the "
+            "others over the run."
+        )
+
+
+def evenly(n: int, most: int) -> npt.NDArray[np.int64]:
+    """Places of at most `most` of n things, evenly over them, the first and the last among them."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64))
+
+
+def listed_words(n: int, which: str, all_of_them: str) -> str:
+    """Says which of n rows a table lists, after its own words, and where the others are; "" where it lists all."""
+    return "" if n <= MOST_LISTED else f" Listed are {which} {MOST_LISTED} of {n}; {all_of_them} holds all."
 
 
 def rotation_groups(poses: PoseSequence) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from tomopose.calibration.result import Calibration
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.observations import BallObservations
-from tomopose.report.gather import Joined
+from tomopose.report.gather import MOST_DRAWN, Joined, evenly
 from tomopose.report.page import Figure
 from tomopose.report.style import (
     ACCENT,
@@ -31,7 +31,7 @@ from tomopose.units import Array
 
 def detector_map(calibration: Calibration, joined: Joined, observations: BallObservations | None) -> Figure:
     """Where on the panel the ball was seen."""
-    scanner = calibration.scanner
+    scanner, shown = calibration.scanner, joined.drawn
     u, v = scanner.n_u - 0.5, scanner.n_v - 0.5
     data: list[dict[str, Any]] = [
         {
@@ -46,11 +46,11 @@ def detector_map(calibration: Calibration, joined: Joined, observations: BallObs
         {
             "type": "scatter",
             "mode": "markers",
-            "x": joined.x_D[:, 0],
-            "y": joined.x_D[:, 1],
+            "x": shown.x_D[:, 0],
+            "y": shown.x_D[:, 1],
             "name": "used",
             "marker": {"size": 5.5, "color": ACCENT},
-            "text": joined.pose_id,
+            "text": shown.pose_id,
             "hovertemplate": "pose %{text}<br>%{x:.1f}, %{y:.1f} px<extra></extra>",
         },
     ]
@@ -59,6 +59,7 @@ def detector_map(calibration: Calibration, joined: Joined, observations: BallObs
         rest = [
             k for k, p in enumerate(observations.pose_id) if p not in used and np.isfinite(observations.x_D[k]).all()
         ]
+        rest = [rest[k] for k in evenly(len(rest), MOST_DRAWN)]
         if rest:
             data.append(
                 {
@@ -85,7 +86,7 @@ def detector_map(calibration: Calibration, joined: Joined, observations: BallObs
     )
     return Figure(
         title="Coverage of the detector",
-        meaning="Where the ball was seen on the panel; the frame is its edge.",
+        meaning="Where the ball was seen on the panel; the frame is its edge." + joined.drawn_words,
         look_for="The projections should reach as far out as the object of the scan will; the model is not tested "
         "where there are no points.",
         data=data,
@@ -100,10 +101,11 @@ def detector_map(calibration: Calibration, joined: Joined, observations: BallObs
 
 def rotation_map(joined: Joined) -> Figure | None:
     """Rotations of the poses in three views; None without poses."""
-    if joined.poses is None or joined.group is None:
+    shown = joined.drawn
+    if shown.poses is None or shown.group is None:
         return None
-    w = np.degrees(joined.poses.rotation_vectors())
-    groups = np.array(joined.group)
+    w = np.degrees(shown.poses.rotation_vectors())
+    groups = np.array(shown.group)
     limit = 1.12 * float(np.abs(w).max(initial=0.0)) or 1.0
     data: list[dict[str, Any]] = []
     extra: dict[str, Any] = {}
@@ -133,7 +135,7 @@ def rotation_map(joined: Joined) -> Figure | None:
             )
     return Figure(
         title="Coverage of rotations",
-        meaning="The rotation vector of each pose, seen along three axes.",
+        meaning="The rotation vector of each pose, seen along three axes." + joined.drawn_words,
         look_for="Points on the axes only are single rotations: they cannot distinguish one order of the angles "
         "from another; points off the axes can.",
         data=data,

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from tomopose.calibration.result import Calibration
-from tomopose.report.gather import Joined, minutes
+from tomopose.report.gather import MOST_DRAWN, Joined, evenly, minutes
 from tomopose.report.page import Figure, Table
 from tomopose.report.style import ACCENT, ALERT, LINE, ORANGE, ROTATION_COLOURS, SOFT, axis, layout
 from tomopose.report.words import decimals, number
@@ -26,7 +26,8 @@ def _steps(value: float) -> float:
 
 def quiver(calibration: Calibration, joined: Joined) -> Figure:
     """Residuals as arrows at the place where the ball was seen."""
-    x, r = joined.x_D, joined.r
+    shown = joined.drawn
+    x, r = shown.x_D, shown.r
     low, high = x.min(axis=0), x.max(axis=0)
     span = float(max((high - low).max(), 1.0))
     longest = float(joined.d.max(initial=0.0))
@@ -60,7 +61,7 @@ def quiver(calibration: Calibration, joined: Joined) -> Figure:
             "y": x[:, 1],
             "showlegend": False,
             "marker": {"size": 4, "color": SOFT},
-            "customdata": [[p, *row, d] for p, row, d in zip(joined.pose_id, r, joined.d, strict=True)],
+            "customdata": [[p, *row, d] for p, row, d in zip(shown.pose_id, r, shown.d, strict=True)],
             "hovertemplate": "pose %{customdata[0]}<br>u %{customdata[1]:.4~g} px, v %{customdata[2]:.4~g} px"
             "<br>length %{customdata[3]:.4~g} px<extra></extra>",
         },
@@ -79,7 +80,8 @@ def quiver(calibration: Calibration, joined: Joined) -> Figure:
     ]
     return Figure(
         title="Residuals on the detector",
-        meaning=f"Each arrow is observed minus calculated ball centre, drawn at {scale:g} times its length.",
+        meaning=f"Each arrow is observed minus calculated ball centre, drawn at {scale:g} times its length."
+        + joined.drawn_words,
         look_for="Arrows of random direction are noise; a swirl, a common direction or growth towards one side is an "
         "error of the geometry (roll, tilt, distance) or of the manipulator.",
         data=data,
@@ -97,7 +99,8 @@ def quiver(calibration: Calibration, joined: Joined) -> Figure:
 def by_pose(joined: Joined) -> Figure:
     """d_k by pose, coloured by rotation: the paper's fig. 8."""
     data: list[dict[str, Any]] = []
-    groups = joined.group or ("used",) * len(joined.pose_id)
+    shown = joined.drawn
+    groups = shown.group or ("used",) * len(shown.pose_id)
     for name in [*ROTATION_COLOURS, "used"]:
         rows = np.flatnonzero(np.array(groups) == name)
         if rows.size:
@@ -106,9 +109,9 @@ def by_pose(joined: Joined) -> Figure:
                     "type": "scatter",
                     "mode": "markers",
                     "name": f"rotation {name}" if joined.group else "poses",
-                    "x": joined.number[rows],
-                    "y": joined.d[rows],
-                    "text": [joined.pose_id[k] for k in rows],
+                    "x": shown.number[rows],
+                    "y": shown.d[rows],
+                    "text": [shown.pose_id[k] for k in rows],
                     "marker": {"size": 7, "color": ROTATION_COLOURS.get(name, ACCENT), "line": {"width": 0}},
                     "hovertemplate": "pose %{text}<br>d = %{y:.4~g} px<extra></extra>",
                 }
@@ -129,7 +132,7 @@ def by_pose(joined: Joined) -> Figure:
     return Figure(
         title="Reprojection error by pose (paper, fig. 8)",
         meaning="d_k of eq. (8): the distance between detected and calculated ball centre for each pose, coloured by "
-        "the axis of the manipulator's rotation.",
+        "the axis of the manipulator's rotation." + joined.drawn_words,
         look_for="One colour far above the others is a rotation which the manipulator does not perform as it "
         "reports; single points far above are bad images.",
         data=data,
@@ -141,7 +144,9 @@ def by_pose(joined: Joined) -> Figure:
 def over_sequence(joined: Joined) -> Figure:
     """Both components of the residual in the order of acquisition, with a running median."""
     data: list[dict[str, Any]] = []
+    shown = joined.drawn
     order = np.argsort(joined.number, kind="stable")
+    some = evenly(len(order), MOST_DRAWN)
     width = max(5, 2 * (len(order) // 24) + 1)
     for k, (name, colour) in enumerate((("u", ACCENT), ("v", ORANGE))):
         values = joined.r[order, k]
@@ -150,10 +155,10 @@ def over_sequence(joined: Joined) -> Figure:
                 "type": "scatter",
                 "mode": "markers",
                 "name": name,
-                "x": joined.number[order],
-                "y": values,
+                "x": shown.number,
+                "y": shown.r[:, k],
                 "marker": {"size": 4.5, "color": colour, "opacity": 0.55},
-                "text": [joined.pose_id[i] for i in order],
+                "text": shown.pose_id,
                 "hovertemplate": f"pose %{{text}}<br>{name} %{{y:.4~g}} px<extra></extra>",
             }
         )
@@ -163,15 +168,15 @@ def over_sequence(joined: Joined) -> Figure:
                     "type": "scatter",
                     "mode": "lines",
                     "name": f"{name}, running median",
-                    "x": joined.number[order],
-                    "y": _running_median(values, width),
+                    "x": joined.number[order][some],
+                    "y": _running_median(values, width)[some],
                     "hoverinfo": "skip",
                     "line": {"color": colour, "width": 2},
                 }
             )
     return Figure(
         title="Residuals in the order of acquisition",
-        meaning="Residuals in u and v by pose, with a running median.",
+        meaning="Residuals in u and v by pose, with a running median of all." + joined.drawn_words,
         look_for="A slope is drift (temperature, focal spot); a step is a bump, a ball that slipped or a machine that "
         "was referenced anew.",
         data=data,
@@ -188,7 +193,8 @@ def _running_median(values: Array, width: int) -> Array:
 
 def by_coordinate(joined: Joined) -> Figure | None:
     """Residuals against every coordinate of the pose, the table angle and time; None without poses."""
-    poses = joined.poses
+    shown = joined.drawn
+    poses = shown.poses
     if poses is None:
         return None
     angles = np.degrees(poses.T_MH.angles)
@@ -222,19 +228,20 @@ def by_coordinate(joined: Joined) -> Figure | None:
                     "mode": "markers",
                     "name": name,
                     "x": x,
-                    "y": joined.r[:, k],
+                    "y": shown.r[:, k],
                     "xaxis": f"x{suffix}",
                     "yaxis": f"y{suffix}",
                     "legendgroup": name,
                     "showlegend": panel == 0,
                     "marker": {"size": 4, "color": colour, "opacity": 0.55},
-                    "text": joined.pose_id,
+                    "text": shown.pose_id,
                     "hovertemplate": f"pose %{{text}}<br>{name} %{{y:.4~g}} px<extra></extra>",
                 }
             )
     return Figure(
         title="Residuals against each coordinate of the pose",
-        meaning="The same residuals against position and angles of the manipulator, table angle and time.",
+        meaning="The same residuals against position and angles of the manipulator, table angle and time."
+        + joined.drawn_words,
         look_for="A slope against a position is a scale or axis error, a slope against an angle a wrong rotation axis, "
         "two branches at one value are backlash.",
         data=data,
@@ -319,6 +326,9 @@ def quantiles(joined: Joined) -> Figure:
     z = np.sort(joined.z.ravel())
     q = ndtri((np.arange(1, z.size + 1) - 0.5) / z.size)
     end = 1.1 * float(max(np.abs(q).max(initial=1.0), 1.0))
+    # the ends are what is looked at: evenly in the quantile, not in the rank
+    places = np.linspace(q[0], q[-1], MOST_DRAWN)
+    some = np.unique(np.searchsorted(q, places)) if z.size > 2 * MOST_DRAWN else np.arange(z.size)
     return Figure(
         title="Quantiles against the normal law",
         meaning="Sorted normalised residuals against the quantiles of the normal law.",
@@ -337,8 +347,8 @@ def quantiles(joined: Joined) -> Figure:
             {
                 "type": "scatter",
                 "mode": "markers",
-                "x": q,
-                "y": z,
+                "x": q[some],
+                "y": z[some],
                 "marker": {"size": 4.5, "color": ACCENT},
                 "hovertemplate": "expected %{x:.2f}, found %{y:.2f}<extra></extra>",
                 "showlegend": False,

@@ -128,7 +128,7 @@ def scanner_scene(calibration: Calibration, joined: Joined) -> Figure:
         _line(axis_line, SOFT, "table axis", width=4, dash="dash"),
         *_triad(manipulator_in_world(calibration), 0.16 * scanner.d_SD / 2, "H"),
     ]
-    ball = ball_in_world(calibration, joined)
+    ball = ball_in_world(calibration, joined.drawn)
     if ball is not None:
         data.append(_points(ball, "ball positions", size=2.5, color=ALERT))
     return Figure(
@@ -143,7 +143,8 @@ def scanner_scene(calibration: Calibration, joined: Joined) -> Figure:
 
 def ball_scene(calibration: Calibration, joined: Joined) -> Figure | None:
     """The ball's places in W, coloured by the residual; None without poses."""
-    ball = ball_in_world(calibration, joined)
+    shown = joined.drawn
+    ball = ball_in_world(calibration, shown)
     if ball is None:
         return None
     frame = manipulator_in_world(calibration)
@@ -152,18 +153,19 @@ def ball_scene(calibration: Calibration, joined: Joined) -> Figure | None:
         ball,
         "ball",
         size=4.5,
-        color=joined.d,
+        color=shown.d,
         colorscale=SEQUENTIAL,
         showscale=True,
         colorbar=colour_bar("d / px", len=0.7),
     )
-    dots["text"] = joined.pose_id
+    dots["text"] = shown.pose_id
     dots["hovertemplate"] = (
         "pose %{text}<br>%{x:.2f}, %{y:.2f}, %{z:.2f} mm<br>d = %{marker.color:.4~g} px<extra></extra>"
     )
     return Figure(
         title="Where the ball was",
-        meaning="Ball centres of all poses in W and the manipulator's frame H; colour is the reprojection error.",
+        meaning="Ball centres of all poses in W and the manipulator's frame H; colour is the reprojection error."
+        + joined.drawn_words,
         look_for="The cloud should fill the volume that the scan will use; a coloured side points at a place-dependent "
         "error.",
         data=[dots, *_triad(frame, 0.35 * span, "H")],

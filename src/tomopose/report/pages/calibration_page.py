@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
 from tomopose.report.figures import coverage_figures, residual_figures, scene_figures
 from tomopose.report.figures.thumbnails import Thumbnail
-from tomopose.report.gather import Joined, join
+from tomopose.report.gather import MOST_LISTED, Joined, join, listed_words
 from tomopose.report.page import (
     BAD,
     CARE,
@@ -220,9 +221,10 @@ def _detections(
         blocks.append(
             Table(
                 title="Set aside",
-                meaning="Images that do not take part in the result, and why.",
+                meaning="Images that do not take part in the result, and why."
+                + listed_words(len(aside), "the first", "calibration.json"),
                 columns=["pose", "reason"],
-                rows=[[p, reason] for p, reason in aside.items()],
+                rows=[[p, reason] for p, reason in islice(aside.items(), MOST_LISTED)],
                 wide=len(aside) > 8,
             )
         )
@@ -256,7 +258,7 @@ def _pose_table(joined: Joined, observations: BallObservations | None) -> Table:
         snr = dict(zip(observations.pose_id, map(float, observations.snr), strict=True))
     rows = []
     k_px = decimals(joined.d)
-    for k in np.argsort(-joined.d, kind="stable"):
+    for k in np.argsort(-joined.d, kind="stable")[:MOST_LISTED]:
         pose = joined.pose_id[k]
         rows.append(
             [
@@ -272,8 +274,9 @@ def _pose_table(joined: Joined, observations: BallObservations | None) -> Table:
             ]
         )
     return Table(
-        title="All poses used, worst first",
-        meaning="A click on a column's head sorts by it.",
+        title=f"{'All' if len(rows) == len(joined.d) else 'The worst'} poses used, worst first",
+        meaning="A click on a column's head sorts by it."
+        + listed_words(len(joined.d), "the worst", "calibration.json (residuals)"),
         columns=[
             "pose",
             "rotation",

@@ -12,6 +12,7 @@ from tomopose.provenance import Provenance
 from tomopose.report.figures.coverage_figures import scan_effect
 from tomopose.report.figures.scene_figures import source_path
 from tomopose.report.figures.thumbnails import Thumbnail
+from tomopose.report.gather import MOST_DRAWN, MOST_LISTED, evenly, listed_words
 from tomopose.report.page import (
     BAD,
     CARE,
@@ -51,12 +52,11 @@ def observations_report(
     blocks.append(
         Table(
             title="Not used",
-            meaning="Images without a measured ball, and why.",
+            meaning="Images without a measured ball, and why." + listed_words(lost, "the first", "observations.csv"),
             columns=["pose", "image", "status"],
             rows=[
                 [pose, observations.image[k] if observations.image else "–", _status(observations, k)]
-                for k, pose in enumerate(observations.pose_id)
-                if not observations.seen[k]
+                for k, pose in ((k, observations.pose_id[k]) for k in np.flatnonzero(~observations.seen)[:MOST_LISTED])
             ],
         )
         if lost
@@ -123,11 +123,18 @@ def _detection_keys(observations: BallObservations) -> list[KeyFigure]:
     ]
 
 
+def _drawn_words(drawn: int, n: int) -> str:
+    """Says how many of n images a figure shows; "" where it shows all."""
+    return "" if drawn == n else f" Drawn are {drawn} of {n}, evenly over the run."
+
+
 def _positions(observations: BallObservations) -> Figure:
-    x = observations.used.x_D
+    used = observations.used
+    shown = used.select(evenly(len(used), MOST_DRAWN))
+    x = shown.x_D
     return Figure(
         title="Where the ball was seen",
-        meaning="Projected ball centres on the detector.",
+        meaning="Projected ball centres on the detector." + _drawn_words(len(shown), len(used)),
         look_for="A regular plan gives a regular pattern; a point out of line is a wrong ball or a wrong pairing.",
         data=[
             {
@@ -135,7 +142,7 @@ def _positions(observations: BallObservations) -> Figure:
                 "mode": "markers",
                 "x": x[:, 0],
                 "y": x[:, 1],
-                "text": observations.used.pose_id,
+                "text": shown.pose_id,
                 "marker": {"size": 5.5, "color": ACCENT},
                 "hovertemplate": "pose %{text}<br>%{x:.2f}, %{y:.2f} px<extra></extra>",
             }
@@ -152,20 +159,21 @@ def _positions(observations: BallObservations) -> Figure:
 
 def _sigmas(observations: BallObservations) -> Figure:
     sigma = np.where(observations.seen[:, None], observations.sigma, np.nan)
-    order = np.arange(1, len(observations) + 1)
+    shown = evenly(len(observations), MOST_DRAWN)
     return Figure(
         title="Standard uncertainty by image",
-        meaning="Predicted standard uncertainty of the centre in u and v.",
+        meaning="Predicted standard uncertainty of the centre in u and v."
+        + _drawn_words(len(shown), len(observations)),
         look_for="It should be level; a rising line is a failing exposure or a source that drifts out of focus.",
         data=[
             {
                 "type": "scatter",
                 "mode": "markers",
                 "name": name,
-                "x": order,
-                "y": sigma[:, k],
+                "x": shown + 1,
+                "y": sigma[shown, k],
                 "marker": {"size": 5, "color": colour},
-                "text": observations.pose_id,
+                "text": [observations.pose_id[i] for i in shown],
                 "hovertemplate": f"pose %{{text}}<br>{name} %{{y:.5f}} px<extra></extra>",
             }
             for k, (name, colour) in enumerate((("u", ACCENT), ("v", ORANGE)))
@@ -178,6 +186,7 @@ def _sigmas(observations: BallObservations) -> Figure:
 
 def _all_rows(observations: BallObservations) -> Section:
     sigma = observations.sigma
+    worst_first = np.argsort(np.where(observations.seen, -sigma.max(axis=1), -np.inf), kind="stable")
     rows = [
         [
             p,
@@ -187,14 +196,16 @@ def _all_rows(observations: BallObservations) -> Section:
             number(sigma[k, 1]),
             _status(observations, k),
         ]
-        for k, p in enumerate(observations.pose_id)
+        for k, p in ((k, observations.pose_id[k]) for k in np.sort(worst_first[:MOST_LISTED]))
     ]
+    which = "those without a ball and the most uncertain"
     return Section(
         title="All images",
         blocks=[
             Table(
                 title="Rows",
-                meaning="A click on a column's head sorts by it.",
+                meaning="A click on a column's head sorts by it."
+                + listed_words(len(observations), which, "observations.csv"),
                 folded=True,
                 numeric=(1, 2, 3, 4),
                 columns=["pose", "u / px", "v / px", "σ_u / px", "σ_v / px", "status"],
