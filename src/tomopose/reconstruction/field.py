@@ -241,7 +241,7 @@ class DaskField:
     ) -> None:
         self.grid = grid
         self._bounds = slab_bounds(grid.shape[0], slabs)
-        workers = sorted(client.scheduler_info(n_workers=-1)["workers"])
+        workers = sorted(client.nthreads())
         futures = [
             client.submit(
                 Piece,

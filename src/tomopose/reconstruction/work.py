@@ -135,7 +135,7 @@ def open_field(work: Work, execution: Execution) -> Field:
     options = dict(execution.engine_options)
     client: Any = execution.client  # dask is optional and untyped
     if client is not None:
-        workers = len(client.scheduler_info(n_workers=-1)["workers"])
+        workers = len(client.nthreads())
         if workers == 0:
             raise EngineError("the dask client has no workers")
         slabs = execution.slabs or workers

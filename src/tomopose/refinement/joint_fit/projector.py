@@ -80,7 +80,7 @@ class Projector:
             total += part
         return total
 
-    def _there(self, function: Callable[..., Any], state: np.ndarray | None, images: Sequence[Floats] | None) -> Any:
+    def _there(self, function: Callable[..., object], state: np.ndarray | None, images: Sequence[Floats] | None) -> Any:
         """What the workers make of each piece, in order."""
         client = self._workers.client
         if not client.nthreads():
