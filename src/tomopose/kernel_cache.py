@@ -95,7 +95,9 @@ def compile_each_time() -> None:
 
 
 if TYPE_CHECKING:
-    from numba import njit
+    import numba
+
+    njit = numba.njit
 else:
 
     def njit(**options):

@@ -241,7 +241,7 @@ class DaskField:
     ) -> None:
         self.grid = grid
         self._bounds = slab_bounds(grid.shape[0], slabs)
-        workers = sorted(client.nthreads())
+        workers = sorted(client.nthreads())  # type: ignore[no-untyped-call]
         futures = [
             client.submit(
                 Piece,

@@ -46,7 +46,7 @@ def remainders(
     together: dict[int, list[int]] = {}
     for k, one in enumerate(cameras):
         together.setdefault(id(one), []).append(k)
-    found = {}
+    found: dict[int, Remainder] = {}
     for members in together.values():
         some = _of_one_table([problems[k] for k in members], cameras[members[0]], [fits[k] for k in members], free)
         found.update(zip(members, some, strict=True))
