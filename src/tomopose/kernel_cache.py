@@ -112,43 +112,39 @@ else:
 
 @functools.cache
 def _let_collector_rest() -> None:
-    """No garbage collection from the start of the outermost compilation to its end, in whichever threads they are.
+    """No garbage collection from the start of the outermost compilation to its end.
 
     A compilation makes some hundred thousand objects beside all that scipy and numba hold.  The collector would go
     through them again and again and find little to free.
     """
-    from numba.core import event as untyped_event
-    from numba.core.event import Event, Listener
+    was_on = False
 
-    events: Any = untyped_event
+    def told(now: bool) -> None:
+        nonlocal was_on
+        if now:
+            was_on = gc.isenabled()
+            gc.disable()
+        elif was_on:
+            gc.enable()
 
-    class CollectorRests(Listener):
-        """Kernels that call others are compiled one inside the other: the outermost counts."""
-
-        depth = 0
-        was_on = False
-        lock = threading.Lock()
-
-        def on_start(self, event: Event) -> None:
-            with self.lock:
-                if self.depth == 0:
-                    self.was_on = gc.isenabled()
-                    gc.disable()
-                self.depth += 1
-
-        def on_end(self, event: Event) -> None:
-            with self.lock:
-                self.depth -= 1
-                if self.depth == 0 and self.was_on:
-                    gc.enable()
-
-    events.register("numba:compile", CollectorRests())
+    _listen_to_compiling(told)
 
 
 @contextlib.contextmanager
 def reporting_compiling(told: Callable[[bool], None]) -> Iterator[None]:
     """Calls told(True) when this process begins to compile a kernel and told(False) when it ends; not for kernels that
     are loaded from the cache.
+    """
+    stop = _listen_to_compiling(told)
+    try:
+        yield
+    finally:
+        stop()
+
+
+def _listen_to_compiling(told: Callable[[bool], None]) -> Callable[[], None]:
+    """Calls told(True) when the outermost compilation begins and told(False) when it ends, in whichever threads they
+    are; what it returns ends that.
     """
     from numba.core import event as untyped_event
     from numba.core.event import Event, Listener
@@ -159,20 +155,20 @@ def reporting_compiling(told: Callable[[bool], None]) -> Iterator[None]:
         """Kernels that call others are compiled one inside the other: only the outermost counts."""
 
         depth = 0
+        lock = threading.RLock()
 
         def on_start(self, event: Event) -> None:
-            self.depth += 1
-            if self.depth == 1:
-                told(True)
+            with self.lock:
+                self.depth += 1
+                if self.depth == 1:
+                    told(True)
 
         def on_end(self, event: Event) -> None:
-            self.depth -= 1
-            if self.depth == 0:
-                told(False)
+            with self.lock:
+                self.depth -= 1
+                if self.depth == 0:
+                    told(False)
 
     listener = Compiling()
     events.register("numba:compile", listener)
-    try:
-        yield
-    finally:
-        events.unregister("numba:compile", listener)
+    return lambda: events.unregister("numba:compile", listener)

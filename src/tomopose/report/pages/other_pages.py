@@ -55,8 +55,12 @@ def observations_report(
             meaning="Images without a measured ball, and why." + listed_words(lost, "the first", "observations.csv"),
             columns=["pose", "image", "status"],
             rows=[
-                [pose, observations.image[k] if observations.image else "–", _status(observations, k)]
-                for k, pose in ((k, observations.pose_id[k]) for k in np.flatnonzero(~observations.seen)[:MOST_LISTED])
+                [
+                    observations.pose_id[k],
+                    observations.image[k] if observations.image else "–",
+                    _status(observations, k),
+                ]
+                for k in np.flatnonzero(~observations.seen)[:MOST_LISTED]
             ],
         )
         if lost
@@ -189,14 +193,14 @@ def _all_rows(observations: BallObservations) -> Section:
     worst_first = np.argsort(np.where(observations.seen, -sigma.max(axis=1), -np.inf), kind="stable")
     rows = [
         [
-            p,
+            observations.pose_id[k],
             f"{observations.x_D[k, 0]:.4f}",
             f"{observations.x_D[k, 1]:.4f}",
             number(sigma[k, 0]),
             number(sigma[k, 1]),
             _status(observations, k),
         ]
-        for k, p in ((k, observations.pose_id[k]) for k in np.sort(worst_first[:MOST_LISTED]))
+        for k in np.sort(worst_first[:MOST_LISTED])
     ]
     which = "those without a ball and the most uncertain"
     return Section(
