@@ -160,9 +160,12 @@ def scanner_vectors_at(s_0: Array, free: FreeParameters, delta: Array) -> Array:
 
 def scanners_can_be(s: Array) -> npt.NDArray[np.bool_]:
     """(a,): whether scanner vectors s (a, runs, 13) are ones that a `Scanner` accepts."""
-    d_SD, d_SR, p_u, p_v, theta, phi, tilt_x, tilt_y = (s[..., k] for k in (0, 1, 2, 3, 7, 8, 10, 11))
-    tilts = np.maximum(np.maximum(abs(theta), abs(phi)), np.maximum(abs(tilt_x), abs(tilt_y)))
-    can_be = (d_SR > 0) & (d_SD > d_SR) & (p_u > 0) & (p_v > 0) & (tilts <= LARGEST_TILT)
+    of = dict(zip(SCANNER_COLUMNS, np.moveaxis(s, -1, 0), strict=True))
+    can_be = (
+        np.isfinite(s).all(axis=-1) & (of["d_SR"] > 0) & (of["d_SD"] > of["d_SR"]) & (of["p_u"] > 0) & (of["p_v"] > 0)
+    )
+    for name in ("theta", "phi", "axis_tilt_x", "axis_tilt_y"):
+        can_be &= abs(of[name]) <= LARGEST_TILT
     return np.asarray(can_be.all(axis=1))
 
 
