@@ -55,3 +55,15 @@ def test_without_poses_it_is_what_the_matrices_state_and_the_settings_win(calibr
     assert px == pytest.approx(np.sqrt(np.mean(matrices.points_sigma**2)))
     _, px = prior_of(matrices, GRID, tp.RefineSettings(sigma_px=0.3), calibration)
     assert px == pytest.approx(0.3)
+
+
+def test_binned_images_get_the_same_motions_and_a_scatter_in_their_own_pixels(calibrated):
+    calibration, scan, matrices = calibrated
+    binned = tp.projection_matrices(calibration, scan, binning=4)
+    (L, C), (L_binned, C_binned) = (shared_motions(calibration, scan, m, GRID) for m in (matrices, binned))
+    np.testing.assert_allclose(L_binned, L, rtol=1e-6, atol=1e-6 * np.abs(L).max())
+    np.testing.assert_array_equal(C_binned, C)
+    px, px_binned = (prior_of(m, GRID, tp.RefineSettings(), calibration, scan)[1] for m in (matrices, binned))
+    assert px_binned == pytest.approx(px / 4)
+    silent = replace(binned, points_sigma=None)
+    assert prior_of(silent, GRID, tp.RefineSettings(), calibration)[1] == pytest.approx(calibration.d_rms / 4)

@@ -40,7 +40,7 @@ def prior_of(
     views: what the ball knows of the slow errors, which images half a turn apart cannot tell.
     """
     n, centre = len(matrices), np.asarray(grid.centre)
-    own = None if calibration is None or poses is None else scatter_px(calibration, poses, points_of(grid))
+    own = None if calibration is None or poses is None else scatter_px(calibration, poses, matrices, grid)
     if s.sigma_px is not None:
         px = np.full(n, s.sigma_px)
     elif own is not None and np.all(own > 0):
@@ -48,7 +48,7 @@ def prior_of(
     elif matrices.points_sigma is not None and np.all(matrices.points_sigma > 0):
         px = np.sqrt(np.mean(matrices.points_sigma**2, axis=1))
     elif calibration is not None and calibration.d_rms > 0:
-        px = np.full(n, float(calibration.d_rms))
+        px = np.full(n, calibration.d_rms * np.sqrt(np.mean(pixel_ratio(calibration, matrices) ** 2)))
     else:
         px = np.full(n, DEFAULT_SIGMA_PX)
     K = pixel_jacobian(matrices.P, centre[None], centre)[:, 0, :, :3]  # px per mm
@@ -59,9 +59,16 @@ def prior_of(
     return prior, float(np.sqrt(np.mean(px**2)))
 
 
-def scatter_px(calibration: Calibration, poses: PoseSequence, points: Array) -> Array:
+def pixel_ratio(calibration: Calibration, matrices: ProjectionMatrices) -> Array:
+    """(2,): u and v in pixels of the matrices for one pixel of the calibration's scanner, below 1 for binned images."""
+    scanner = calibration.scanner
+    return np.array([scanner.p_u / matrices.p_u, scanner.p_v / matrices.p_v])
+
+
+def scatter_px(calibration: Calibration, poses: PoseSequence, matrices: ProjectionMatrices, grid: VoxelGrid) -> Array:
     """(n,) px per coordinate: the manipulator's scatter from view to view, by the calibration; 0 where it has none."""
-    return np.asarray(np.sqrt(np.mean(scatter_variance(calibration, poses, plate_points(calibration, points)), (1, 2))))
+    variance = scatter_variance(calibration, poses, plate_points(calibration, points_of(grid)))
+    return np.asarray(np.sqrt(np.mean(variance * pixel_ratio(calibration, matrices) ** 2, (1, 2))))
 
 
 def shared_motions(
@@ -70,6 +77,7 @@ def shared_motions(
     """L (n, 6, c): each view's motion by each error that the calibration may have, and C (c, c), their covariance."""
     points = points_of(grid)
     J, C = scan_jacobian(calibration, poses, plate_points(calibration, points))
+    J = J * pixel_ratio(calibration, matrices)[:, None]
     K = pixel_jacobian(matrices.P, points, np.asarray(grid.centre)).reshape(len(matrices), -1, 6)
     scale = np.linalg.norm(K, axis=1, keepdims=True)
     pulled = np.linalg.pinv(K / scale) @ J.reshape(len(matrices), K.shape[1], -1)
