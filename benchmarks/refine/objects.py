@@ -5,6 +5,7 @@ Shares no projector, grid or interpolation with the package: a ray of pixel (u, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -188,12 +189,13 @@ def scan(
     noise: float = 0.005,
     hardening: float = 0.0,
     panel: Panel | None = None,
+    integrals: Callable[[np.ndarray, list[Solid], Panel], np.ndarray] = line_integrals,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Panel]:
-    """images (n, n_v, n_u) transmissions with noise, P as calibrated, P true, panel."""
+    """images (n, n_v, n_u) transmissions with noise, P as calibrated, P true, panel; integrals: who casts the rays."""
     panel = panel or Panel()
     P = matrices(path(way, n), np.zeros((n, 3)), panel)
     P_true = moved(P, errors(kind, n, seed, panel))
-    p = line_integrals(P_true, OBJECTS[obj](), panel)
+    p = integrals(P_true, OBJECTS[obj](), panel)
     if hardening:
         p = p - hardening * p**2
     rng = np.random.default_rng(1000 + seed)

@@ -3,8 +3,11 @@
     python benchmarks/refine/run.py --out table.jsonl              # all rows; rows that are there already are kept
     python benchmarks/refine/run.py --out table.jsonl --only jump  # rows whose name holds a word
     python benchmarks/refine/run.py --out table.jsonl --print      # the table alone
+    python benchmarks/refine/run.py --out table.jsonl --seed 10    # other errors and noise: 10 is added to each seed
+    python benchmarks/refine/run.py --out table.jsonl --images gvxr --only white   # gVirtualXray casts the rays
 
-Images come from line integrals in closed form (objects.py), which share nothing with the package.  Errors are rms
+Images come from line integrals in closed form (objects.py), which share nothing with the package, or from gVirtualXray
+(meshes.py).  Errors are rms
 distances, px, at the corners of a box of 16 mm, one rigid pose of the object removed.
 """
 
@@ -15,10 +18,11 @@ import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from unittest.mock import patch
 
+import meshes
 import numpy as np
 import objects
 
@@ -35,11 +39,14 @@ from tomopose.refinement.joint_fit.pyramid import level_of
 from tomopose.refinement.prior import Prior, with_shared_errors
 from tomopose.refinement.stated import prior_of
 
+INTEGRALS = {"closed form": objects.line_integrals, "gvxr": meshes.line_integrals}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
     """One scan of 64 views of 109 x 101 px; voxel: mm, of 72^3; goal: px.
 
+    images: who casts the rays, one of INTEGRALS.
     covariance: the prior holds the covariance from which the slow errors were drawn, correlated over the views, as a
     calibration that identified the manipulator states it; otherwise `tp.refine` knows nothing of the errors.
     """
@@ -54,9 +61,23 @@ class Case:
     seed: int = 0
     voxel: float = 0.28
     covariance: bool = False
+    images: str = "closed form"
 
     def scan(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, objects.Panel]:
-        return objects.scan(self.obj, self.way, self.errors, noise=self.noise, hardening=self.hardening, seed=self.seed)
+        return objects.scan(
+            self.obj,
+            self.way,
+            self.errors,
+            noise=self.noise,
+            hardening=self.hardening,
+            seed=self.seed,
+            integrals=INTEGRALS[self.images],
+        )
+
+    def changed(self, images: str, seed: int) -> Case:
+        """The same scan with images from another simulator, and `seed` added to its own; its name says both."""
+        name = self.name + (f", {images}" if images != self.images else "") + (f", seed + {seed}" if seed else "")
+        return replace(self, name=name, images=images, seed=self.seed + seed)
 
 
 STEP = {"obj": "step cylinder", "noise": 0.01}
@@ -220,11 +241,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--only", default="")
     parser.add_argument("--print", action="store_true")
+    parser.add_argument("--images", choices=tuple(INTEGRALS), default="closed form")
+    parser.add_argument("--seed", type=int, default=0, help="added to each scan's own")
     a = parser.parse_args()
     rows = [json.loads(line) for line in a.out.read_text().splitlines()] if a.out.exists() else []
     known = {r["name"] for r in rows}
-    work = [(case.name, row_of, case) for case in CASES]
-    work.append((f"{CASES[0].name}: alternation beside", alternation, CASES[0]))
+    cases = [case.changed(a.images, a.seed) for case in CASES]
+    work = [(case.name, row_of, case) for case in cases]
+    work.append((f"{cases[0].name}: alternation beside", alternation, cases[0]))
     for name, make, case in work:
         if a.print or name in known or a.only not in name:
             continue
