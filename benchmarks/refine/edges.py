@@ -17,7 +17,7 @@ def main() -> None:
     for name in objects.OBJECTS:
         images, P, _, panel = objects.scan(name, "seven", "white", n=32, noise=0.01)
         scan = line_integrals_of(images, table.matrices_of(P, panel), "transmission", None)
-        data[name] = measured.measured(scan, tp.VoxelGrid.cube(n=72, spacing=0.32), held_out=0.08, seed=0)
+        data[name] = measured.measured(scan, tp.VoxelGrid.cube(n=72, spacing=0.32))
     for matter in (0.03, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5):
         right = []
         for crossed in (0.02, 0.05, 0.1, 0.2, 0.4):

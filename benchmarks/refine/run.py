@@ -33,7 +33,7 @@ from tomopose.reconstruction.run import line_integrals_of
 from tomopose.refinement.estimate import Steps, estimate
 from tomopose.refinement.halves import matched_to
 from tomopose.refinement.joint_fit.fit import Fit, blank
-from tomopose.refinement.joint_fit.measured import measured
+from tomopose.refinement.joint_fit.measured import measured, with_held_out
 from tomopose.refinement.joint_fit.projector import Workers
 from tomopose.refinement.joint_fit.pyramid import level_of
 from tomopose.refinement.prior import Prior, with_shared_errors
@@ -194,7 +194,8 @@ def alternation(case: Case, rounds: int = 10) -> dict[str, object]:
     """Reconstruct, match each view to the volume, and again, at images binned by 2; the joint fit beside it."""
     images, P, truth, panel = case.scan()
     matrices, grid, s = matrices_of(P, panel), tp.VoxelGrid.cube(n=72, spacing=case.voxel), tp.RefineSettings()
-    data = measured(line_integrals_of(images, matrices, "transmission", None), grid, held_out=s.held_out, seed=0)
+    data = measured(line_integrals_of(images, matrices, "transmission", None), grid)
+    data = with_held_out(data, s.held_out, coarsest=2, seed=0)
     prior, _ = prior_of(matrices, grid, s, None)
     level, workers = level_of(data, 2), Workers(threads=processors())
     state, errors = blank(level), []

@@ -13,11 +13,12 @@ import tomopose as tp
 from tomopose.errors import EngineError
 from tomopose.refinement.estimate import judged_at, levels_of
 from tomopose.refinement.joint_fit.linear import Linear
-from tomopose.refinement.joint_fit.measured import Measured
+from tomopose.refinement.joint_fit.measured import Measured, with_held_out
 from tomopose.refinement.joint_fit.motions import pixel_jacobian
 from tomopose.refinement.joint_fit.precondition import passed_frequencies
 from tomopose.refinement.joint_fit.projector import PIECE, Projector, Workers
-from tomopose.refinement.joint_fit.pyramid import SHARPEST, px_per_mm, smoothed
+from tomopose.refinement.joint_fit.pyramid import SHARPEST, level_of, px_per_mm, smoothed
+from tomopose.refinement.judge import Evidence, Trial, Verdict, decide
 from tomopose.refinement.prior import scatter
 from tomopose.refinement.run import jumps
 from tomopose.refinement.settings import OPEN_PX
@@ -63,6 +64,30 @@ def test_a_held_out_pixel_that_is_mixed_with_others_judges_no_longer():
     kept = level.judge.reshape(judge.shape) > 0
     assert kept[:, 9:15, 9:15].all()
     assert kept.sum() == 12 * 36
+
+
+@pytest.mark.parametrize("levels", [(2, 1), (4, 2, 1), (8, 4)])
+def test_pixels_are_left_that_judge_at_every_level(levels):
+    P = objects.matrices(objects.path("seven", 12), np.zeros((12, 3)), PANEL)
+    m = tp.ProjectionMatrices(P=P, n_u=376, n_v=344, p_u=0.35, p_v=0.3375, pose_id=tuple(map(str, range(12))))
+    ones = np.ones((12, 376 * 344), dtype=np.float32)
+    grid = tp.VoxelGrid.cube(n=20, spacing=8.0)  # so coarse that every level is smoothed
+    data = Measured(p=0 * ones, weight=ones, judge=0 * ones, matrices=m, grid=grid)
+    data = with_held_out(data, 0.08, coarsest=levels[0], seed=0)
+    assert np.mean(data.judge > 0) == pytest.approx(0.08, abs=0.03)
+    assert np.all((data.judge > 0) != (data.weight > 0))
+    for factor in levels:
+        level = level_of(data, factor)
+        assert any(level.blur)
+        assert np.mean(level.judge > 0) > 0.01
+
+
+def test_a_fit_that_no_pixel_judges_is_not_determined():
+    n = np.zeros(3)
+    silent = Trial(before=n, after=n, pixels=0, gain=-np.inf, residual_before=n, residual_after=n)
+    verdict, reasons = decide(Evidence(held_out=silent, chi=1.0, faces=(), left=1.0, edges=(), open_=(), moved=9.0))
+    assert verdict is Verdict.UNDETERMINED
+    assert "held_out" in reasons[0]
 
 
 def test_preconditioned_turns_come_nearer_to_the_solution_than_as_many_plain_ones():

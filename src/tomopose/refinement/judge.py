@@ -32,12 +32,13 @@ class Trial:
     """before, after: (n,) rms residual of each view's held-out pixels over their noise, with the input's geometry and
     with the refined one, each with a volume fitted to the same other pixels.
 
-    gain: mean gain of the views' chi square in standard errors; residual_before, residual_after: (n,) rms over all
-    pixels, relative to the view's line integrals.
+    pixels: how many judged.  gain: mean gain of the views' chi square in standard errors; residual_before,
+    residual_after: (n,) rms over all pixels, relative to the view's line integrals.
     """
 
     before: Array
     after: Array
+    pixels: int
     gain: float
     residual_before: Array
     residual_after: Array
@@ -57,24 +58,33 @@ def trial(data: Measured, refined: State, fit: Fit) -> tuple[Trial, State, State
         size = np.sqrt(np.einsum("np,np->n", data.p, data.p, dtype=np.float64))
         residuals.append(np.sqrt(np.einsum("np,np->n", r, r, dtype=np.float64)) / np.maximum(size, 1e-30))
         states.append(state)
-    count = np.maximum((data.judge > 0).sum(axis=1), 1)
-    gains = (squares[0] - squares[1]) / count
-    error = float(np.std(gains, ddof=1)) / np.sqrt(len(gains)) if len(gains) > 1 else float("inf")
-    mean = float(np.mean(gains))
-    # one view that jumps is a gain although the spread over the views is as large: its own pixels say so
-    noise = np.sqrt(2 * np.mean(squares[1] / count) ** 2 * 2 / count)
-    single = float(np.max(gains / noise)) - 2.0
+    pixels = (data.judge > 0).sum(axis=1)
+    count = np.maximum(pixels, 1)
     return (
         Trial(
             before=np.sqrt(squares[0] / count) / data.noise_left,
             after=np.sqrt(squares[1] / count) / data.noise_left,
-            gain=max(mean / max(error, 1e-30), min(single, 1e3) if mean > 0 else -np.inf),
+            pixels=int(pixels.sum()),
+            gain=gain_of(squares[0] / count, squares[1] / count, count) if pixels.any() else -np.inf,
             residual_before=residuals[0],
             residual_after=residuals[1],
         ),
         states[0],
         states[1],
     )
+
+
+def gain_of(before: Array, after: Array, count: Array) -> float:
+    """The gain, in standard errors, from the views' mean squares (n,) over `count` pixels each.
+
+    One view that jumps is a gain although the spread over the views is as large: its own pixels say so.
+    """
+    gains = before - after
+    error = float(np.std(gains, ddof=1)) / np.sqrt(len(gains)) if len(gains) > 1 else float("inf")
+    mean = float(np.mean(gains))
+    noise = np.sqrt(2 * np.mean(after) ** 2 * 2 / count)
+    single = float(np.max(gains / noise)) - 2.0
+    return max(mean / max(error, 1e-30), min(single, 1e3) if mean > 0 else -np.inf)
 
 
 def residual(data: Measured, state: State, *, workers: Workers) -> Floats:
@@ -127,6 +137,10 @@ def decide(e: Evidence) -> tuple[Verdict, tuple[str, ...]]:
         reasons.append(
             f"The balls' images are off by {e.balls:.1f} times their stated uncertainty: they do not move with the "
             "object, or one was taken for another"
+        )
+    if not e.held_out.pixels:
+        reasons.append(
+            "No pixels were kept out of the fit that could judge it. Keep a larger share of them out (held_out)"
         )
     reasons += e.open_
     if reasons:

@@ -26,7 +26,7 @@ from tomopose.refinement.joint_fit.balls import Balls
 from tomopose.refinement.joint_fit.balls_seen import balls_of, without_shadows
 from tomopose.refinement.joint_fit.fit import Fit, linearised
 from tomopose.refinement.joint_fit.linear import normal_blocks
-from tomopose.refinement.joint_fit.measured import measured, rays_through
+from tomopose.refinement.joint_fit.measured import measured, rays_through, with_held_out
 from tomopose.refinement.joint_fit.motions import transforms
 from tomopose.refinement.joint_fit.projector import Workers
 from tomopose.refinement.joint_fit.pyramid import level_of
@@ -108,13 +108,14 @@ def refine(
     require_usable(matrices, grid)
     scan = line_integrals_of(images, matrices, images_are, correction)
     require_contrast(scan, sorted({0, len(scan) // 3, len(scan) // 2, len(scan) - 1}))
-    data = measured(scan, grid, held_out=s.held_out, seed=s.seed)
+    data = measured(scan, grid)
+    factors = levels_of(data, s)
+    data = with_held_out(data, s.held_out, coarsest=factors[0], seed=s.seed)
     workers = Workers(threads=s.threads or processors(), client=s.client)
     points = balls_of(balls, matrices, np.asarray(grid.centre)) if balls else None
     if points is not None:
         data = without_shadows(data, points)
     prior, stated = prior_of(matrices, grid, s, calibration, poses)
-    factors = levels_of(data, s)
     steps = Steps(2 * len(factors) + 4, progress)
     kept = checkpoint_of(checkpoint, scan, grid, prior, s, factors, points)
     found = estimate(data, factors, prior, s, workers, steps, kept, points)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +18,11 @@ from tomopose.reconstruction.line_integrals import LineIntegrals
 from tomopose.units import Array, Floats
 from tomopose.volume import VoxelGrid
 
-BLOCK = 8
-"""Side of a held-out block, px: wider than the projector's and the detector's blur, two pixels after binning by 4."""
+BLOCK = 4
+"""Side of a held-out block, in pixels of the coarsest level, by which it may be judged: wider than the projector's and
+the detector's blur, with pixels in its middle that the level's smoothing does not mix with others."""
+LEAST_COARSE = 2
+"""The coarsest binning is counted as this at least: a block of 8 px is wider than the blur of a detector too."""
 LEAST_NOISE = 2e-4
 """Standard deviation of a pixel, relative to the largest line integral, that no image falls below: what a projector of
 voxels leaves of an exact line integral's rounding."""
@@ -69,8 +72,8 @@ class Measured:
         return math.sqrt(left)
 
 
-def measured(scan: LineIntegrals, grid: VoxelGrid, *, held_out: float, seed: int) -> Measured:
-    """The scan at full resolution."""
+def measured(scan: LineIntegrals, grid: VoxelGrid) -> Measured:
+    """The scan at full resolution; no pixel judges yet."""
     m, n = scan.matrices, len(scan)
     p = np.empty((n, m.n_u, m.n_v), dtype=np.float32)
     good = np.empty(p.shape, dtype=bool)
@@ -79,22 +82,20 @@ def measured(scan: LineIntegrals, grid: VoxelGrid, *, held_out: float, seed: int
         p[j], good[j] = image.T, ~bad.T
     variance = noise_variance(p, good)
     weight = np.where(good, 1 / variance, 0).astype(np.float32)
-    apart = held_out_blocks(p.shape, held_out, seed)
-    flat = (n, -1)
-    return Measured(
-        p=p.reshape(flat),
-        weight=np.where(apart, 0, weight).reshape(flat),
-        judge=np.where(apart, weight, 0).reshape(flat),
-        matrices=m,
-        grid=grid,
-    )
+    weight = weight.reshape(n, -1)
+    return Measured(p=p.reshape(n, -1), weight=weight, judge=np.zeros_like(weight), matrices=m, grid=grid)
 
 
-def held_out_blocks(shape: tuple[int, int, int], share: float, seed: int) -> npt.NDArray[np.bool_]:
-    """bool (n, n_u, n_v): whole blocks of pixels, drawn by chance, about `share` of all."""
-    n, n_u, n_v = shape
-    drawn = np.random.default_rng([seed, 20]).random((n, -(-n_u // BLOCK), -(-n_v // BLOCK))) < share
-    return np.asarray(drawn.repeat(BLOCK, axis=1).repeat(BLOCK, axis=2)[:, :n_u, :n_v])
+def with_held_out(data: Measured, share: float, *, coarsest: int, seed: int) -> Measured:
+    """The data with whole blocks of pixels, drawn by chance, about `share` of all, that judge and are not fitted.
+
+    coarsest: binning of the coarsest level at which they may judge.
+    """
+    n_u, n_v, side = data.matrices.n_u, data.matrices.n_v, BLOCK * max(coarsest, LEAST_COARSE)
+    drawn = np.random.default_rng([seed, 20]).random((len(data.p), -(-n_u // side), -(-n_v // side))) < share
+    apart = drawn.repeat(side, axis=1).repeat(side, axis=2)[:, :n_u, :n_v].reshape(data.p.shape)
+    zero = np.float32(0)
+    return replace(data, weight=np.where(apart, zero, data.weight), judge=np.where(apart, data.weight, zero))
 
 
 def noise_variance(p: Floats, good: npt.NDArray[np.bool_]) -> Floats:
