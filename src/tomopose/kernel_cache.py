@@ -101,13 +101,14 @@ if TYPE_CHECKING:
 else:
 
     def njit(**options):
-        """`numba.njit` as every kernel here uses it: without the wrapper by which C would call the kernel, and compiled
-        while the garbage collector rests.
+        """`numba.njit` as every kernel here uses it: without the wrapper by which C would call the kernel, with numpy's
+        rule for a division by zero (inf or NaN, no exception and nothing to compile for it), and compiled while the
+        garbage collector rests.
         """
         import numba
 
         _let_collector_rest()
-        return numba.njit(no_cfunc_wrapper=True, **options)
+        return numba.njit(no_cfunc_wrapper=True, error_model="numpy", **options)
 
 
 @functools.cache

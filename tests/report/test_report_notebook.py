@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 
 import numpy as np
 import plotly.graph_objects as go
 import pytest
 
 import tomopose as tp
-from tomopose.errors import InputError, ShapeError
+from tomopose.errors import EngineMissingError, InputError, ShapeError
 
 
 @pytest.mark.parametrize("by", ["pose", "detector", "sequence", "coordinate", "histogram", "quantiles"])
@@ -21,6 +22,13 @@ def test_residuals_are_drawn_in_every_way(sample, by):
     if by == "pose":
         d = np.concatenate([t.y for t in figure.data if t.mode == "markers"])
         np.testing.assert_allclose(np.sort(d), np.sort(calibration.d))
+
+
+def test_without_plotly_the_line_that_installs_it_is_said(sample, monkeypatch):
+    monkeypatch.setitem(sys.modules, "plotly", None)
+    monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
+    with pytest.raises(EngineMissingError, match=r'pip install "tomopose\[notebook\]"'):
+        tp.plot_residuals(sample()[0])
 
 
 def test_what_cannot_be_drawn_is_said(sample):

@@ -23,6 +23,7 @@ EXTRAS = {
     "zeiss": ("olefile",),
     "step": ("cascadio",),
     "dask": ("dask", "distributed"),
+    "notebook": ("plotly",),
 }
 CORE = (
     "numpy",
@@ -36,7 +37,6 @@ CORE = (
     "h5py",
     "pydicom",
     "jinja2",
-    "plotly",
 )
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 

@@ -25,7 +25,7 @@ def solve(N: Array, B: Array) -> Array:
     return np.asarray(X)
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+@njit(cache=True, fastmath={"reassoc", "contract"})
 def _solve(N, B):  # type: ignore[no-untyped-def]
     """(whether N is positive definite, X).
 

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any, Protocol, cast
 
 import numpy as np
-import plotly.graph_objects
 
 from tomopose.calibration.result import Calibration
-from tomopose.errors import InputError, ShapeError
+from tomopose.errors import EngineMissingError, InputError, ShapeError
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.manipulator.poses import PoseSequence
 from tomopose.observations import BallObservations
@@ -33,6 +32,7 @@ ACROSS = 4
 """Detections side by side."""
 GREY = [[0.0, "#000000"], [1.0, "#ffffff"]]
 BLUE = "#39c0ff"
+INSTALL = 'pip install "tomopose[notebook]"'
 
 
 class PlotlyFigure(Protocol):
@@ -50,7 +50,14 @@ class PlotlyFigure(Protocol):
 
 
 def as_plotly(figure: Figure) -> PlotlyFigure:
-    """A report's figure as one of plotly's, with its title."""
+    """A report's figure as one of plotly's, with its title; EngineMissingError without plotly."""
+    try:
+        import plotly.graph_objects
+    except ImportError:
+        raise EngineMissingError(
+            f"figures for a notebook need plotly, which is not installed: {INSTALL}; reports need nothing more",
+            install_line=INSTALL,
+        ) from None
     margin = {**dict(figure.layout.get("margin", {})), "t": 64}
     title = {"text": figure.title, "x": 0.02, "y": 0.98, "yanchor": "top", "font": {"size": 15}}
     made = plotly.graph_objects.Figure(

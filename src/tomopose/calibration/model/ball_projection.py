@@ -59,7 +59,6 @@ def scanner_vector(scanner: Scanner, translation_scale: float = 1.0) -> Array:
 
 _UNCALLED: dict[str, Any] = {
     "cache": True,
-    "error_model": "numpy",
     "no_cpython_wrapper": True,
 }
 
@@ -204,7 +203,7 @@ def _by_table_axis(v: Array, r: int, z: Three, m: Three, w: Three, g: Three, J: 
         out[J + 10 + k] = p - q
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _project_all(s: Array, run: Any, at: Array, poses: Array, wanted: int, found: Array, x: Array) -> None:
     """x (n, 2): the centres, left as they are where a ball is behind the source;  found (n, 52): see X, of which one
     row is enough where only the CENTRE is wanted.

@@ -168,7 +168,7 @@ def take_row(A: Array, B: Array, row: int, where: Any, N: Array) -> int:
     return 0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def normal_equations(rows: Rows, freed: Freed, at: Array, N: Array, g: Array) -> float:
     """chi2 at a point, and N = J^T J and g = J^T r there (r = observed - calculated, whitened).
 
@@ -231,7 +231,7 @@ def normal_equations(rows: Rows, freed: Freed, at: Array, N: Array, g: Array) ->
     return chi2
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _attempt(
     rows: Rows, freed: Freed, at: Array, N: Array, g: Array, lam: float, to: Array, N_to: Array, g_to: Array
 ) -> tuple[float, float, float]:

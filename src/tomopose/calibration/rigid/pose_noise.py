@@ -75,7 +75,7 @@ def total_covariance(covariance: Array, b: ProjectionBlocks, noise: PoseNoise) -
     return covariance + noise.translation**2 * A + noise.rotation**2 * B
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _minus_2_log_likelihood(
     C: Array,
     A: Array,

@@ -22,7 +22,7 @@ STILL = 0.002
 """Move, px, below which a circle counts as fitted: the rays' edges are no better than a tenth."""
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def check_circle(image, u, v, low, high, sign, aspect, noise, tightness, wide, rays):  # type: ignore[no-untyped-def]
     """(found, u, v, radius, complete, visible, contrast) of the circle near (u, v) with radius in [low, high].
 
@@ -78,7 +78,7 @@ def check_circle(image, u, v, low, high, sign, aspect, noise, tightness, wide, r
     return True, u, v, radius, complete, n_seen / RAYS, _disc_contrast(image, u, v, radius, sign, aspect)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def ray_edges(image, u, v, limits, sign, aspect, wide, edge, strength, seen):  # type: ignore[no-untyped-def]
     """Fills radius and strength of the steepest edge of polarity `sign` on each ray, and whether the ray stays in the
     image long enough; returns how many do.
@@ -130,7 +130,7 @@ def _between_pixels(image, x, y):  # type: ignore[no-untyped-def]
     return before + fy * (after - before)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _robust_circle(x, y, start):  # type: ignore[no-untyped-def]
     """(u, v, radius) through most of the points: least squares, points that disagree given less weight (Cauchy)."""
     n, cx, cy, radius = x.shape[0], 0.0, 0.0, start
@@ -170,7 +170,7 @@ def _robust_circle(x, y, start):  # type: ignore[no-untyped-def]
     return cx, cy, radius
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _disc_contrast(image, u, v, radius, sign, aspect):  # type: ignore[no-untyped-def]
     """How much darker (sign +1) the middle is than the surroundings; not positive for a ring or a hole."""
     sample, n_disc, n_around = np.empty((2, 2 * RAYS)), 0, 0
@@ -191,7 +191,7 @@ def _disc_contrast(image, u, v, radius, sign, aspect):  # type: ignore[no-untype
     return sign * (median(sample[1, :n_around]) - median(sample[0, :n_disc]))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def rim_blur(image, u, v, radius, aspect, sign):  # type: ignore[no-untyped-def]
     """Standard deviation, px, of the blur of a circle's rim, from the steepest slope of the mean profile across it.
 

@@ -55,7 +55,7 @@ def _vote_along(out, band, i, j, du, dv, radii):  # type: ignore[no-untyped-def]
             out[band, y, x] += 1.0 / (2.0 * math.pi * radius)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _votes(image, square, threshold, radii, out):  # type: ignore[no-untyped-def]
     """Adds to `out` (polarity, band, rows, columns): 1 for a full circle about that centre; polarity 0 is dark inside.
 

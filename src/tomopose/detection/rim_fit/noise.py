@@ -36,7 +36,7 @@ def excess_variance(square, freedom, rare):  # type: ignore[no-untyped-def]
     return 1.0 + (square - 1.0) / (1.0 + chance)
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+@njit(cache=True, fastmath={"reassoc", "contract"})
 def _weights(s, residual, model, first, stand, parameters, outlier, clipped, kept_below):  # type: ignore[no-untyped-def]
     """(weight (n,), variance inside, outside, excess (k,), spread): weights by a variance linear in the level.
 
@@ -117,7 +117,7 @@ def _weights(s, residual, model, first, stand, parameters, outlier, clipped, kep
     return weight, v_in, v_out, mean, spread
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _quiet(variance, n, clipped, kept_below):  # type: ignore[no-untyped-def]
     """(mean, relative spread) of the sectors' variances that belong together at their low end; orders them.
 

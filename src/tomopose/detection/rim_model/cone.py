@@ -51,7 +51,7 @@ def _metric(scanner: Scanner, x_D: Array) -> Array:
     return np.asarray((J.T @ J - along[:, None] * along / square) / square)
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True)
 def cone_coordinates(u, v, inverse_K, p_u, p_v, u_c, v_c, gamma):  # type: ignore[no-untyped-def]
     """(6, n): s, ds/du_c, ds/dv_c, ds/dgamma, cos psi, sin psi for pixels u, v (n,).
 

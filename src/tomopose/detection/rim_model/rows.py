@@ -47,7 +47,7 @@ class Edge(NamedTuple):
     q_sin: float
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True)
 def model_rows(distance, rim, share, bounds, near_shells, nodes, white, edge):  # type: ignore[no-untyped-def]
     """value (n,) and jacobian (14, n): the model and its derivatives at each pixel.
 
@@ -66,7 +66,7 @@ def model_rows(distance, rim, share, bounds, near_shells, nodes, white, edge):  
     return value, jacobian
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True)
 def _on_edge(distance, rim, share, start, stop, left, right, white, edge, value, jacobian):  # type: ignore[no-untyped-def]
     table, first, step, radius, sigma, gamma_px, variance_u, variance_v, q_sin = edge
     last, per_step, straight, least = table.shape[0] - 2, 1.0 / step, table.shape[1] == STRAIGHT, 0.1 * sigma
@@ -117,7 +117,7 @@ def _on_edge(distance, rim, share, start, stop, left, right, white, edge, value,
         jacobian[13, i] = w * Q
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True)
 def _beyond(distance, rim, share, start, stop, left, right, edge, value, jacobian):  # type: ignore[no-untyped-def]
     """The same where the edge is over: O = 1, R = s, Q = (s^2 + variance) / 2."""
     _, _, _, _, sigma, gamma_px, variance_u, variance_v, q_sin = edge

@@ -179,7 +179,7 @@ def _one_place(M: Array, z: Array, S: Array, x: Array) -> float:
     return gain if trace < 1.0 / SEEN else np.nan
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True)
 def _places(C: Array, Q: Array, r: Array, sums: tuple[Array, Array, Array], M: Array, z: Array, gain: Array) -> None:
     """gain (n,) of a step at each of n rows, from the last one back: C (n, 2, c), Q (n, 2, q), r (n, 2).
 
