@@ -3,8 +3,7 @@
     python benchmarks/planning/run.py                   certificates and worth of five parts, time of a large one
     python benchmarks/planning/run.py --images --views 24 --draws 16    virtual scans: lengths and their uncertainty
     python benchmarks/planning/run.py --images --parts plate bracket    of some parts only
-    python benchmarks/planning/run.py --images --views 24 --draws 0 --paths plan circular   the two predictions alone
-
+    python benchmarks/planning/run.py --images --views 24 --draws 0 --paths plan circular   the predictions alone
 
 Random paths are N of the candidates: the gain is over the best of ten draws, "over one" over their mean.  Judged on
 points that nothing was planned with, counting what leaves the view as if it did not: that favours the usual paths.
@@ -16,10 +15,11 @@ import argparse
 import math
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from parts import CASES, Case
-from scans import PATHS, compare_all
+from scans import PATHS, WAYS, Wanted, compare_all
 
 import tomopose as tp
 from tomopose.planning.part.settings import PartSettings
@@ -125,11 +125,14 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", choices=list(CASES), default=list(CASES))
     parser.add_argument("--draws", type=int, default=16, help="virtual scans of each path")
     parser.add_argument("--paths", nargs="+", choices=PATHS, default=PATHS, help="of the virtual scans")
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS, help="of predicting lengths")
+    parser.add_argument("--kept", type=Path, help="folder that keeps what the virtual scans measured")
     given = parser.parse_args()
     if given.images:
         cases = {name: CASES[name]() for name in given.parts}
         compare_all(
-            {name: (case, setting(case, given.views)) for name, case in cases.items()}, given.draws, given.paths
+            {name: (case, setting(case, given.views)) for name, case in cases.items()},
+            Wanted(draws=given.draws, paths=given.paths, ways=given.ways, kept=given.kept),
         )
     else:
         worth_table(given.views, given.parts)

@@ -90,6 +90,16 @@ def test_a_material_is_looked_up_and_the_assumed_voltage_is_said(words, tmp_path
 
 
 @pytest.mark.slow
+def test_drawn_scans_know_the_beam_that_is_given(words, tmp_path, capsys):
+    asked = [*words, "--material", "Al", "--kv", "120", "--views", "4", "--uncertainty", "drawn", "--draws", "10"]
+    assert run(asked) == 0
+    assert "plan: drawn scans: 10 of 10" in capsys.readouterr().err
+    constants = json.loads((tmp_path / "scan.json").read_text())["constants"]
+    assert (constants["uncertainty"], constants["draws"]) == ("drawn", 10)
+    assert constants["beam_energies"] > 1
+
+
+@pytest.mark.slow
 def test_a_placing_is_stated_and_never_worse_than_as_given(words, tmp_path):
     assert run([*words, "--mu-per-mm", "0.05", "--views", "4", "--placing", "--quiet"]) == 0
     placing = json.loads((tmp_path / "scan.json").read_text())["placing"]
@@ -111,6 +121,7 @@ def test_a_placing_is_stated_and_never_worse_than_as_given(words, tmp_path):
         (["--shape", "circular", "--mu-per-mm", "0.05"], 2, "--part"),
         (["--mu-per-mm", "0.05", "--commands", "siemens"], 2, "siemens"),
         (["--material", "unobtainium"], 1, "unobtainium"),
+        (["--mu-per-mm", "0.05", "--uncertainty", "guessed"], 1, "filters, exact, drawn"),
     ],
 )
 def test_bad_input_is_answered_in_words_and_leaves_nothing(words, tmp_path, capsys, change, code, match):
@@ -157,7 +168,7 @@ def test_the_defaults_of_the_options_are_those_of_the_library():
     for option, degrees in {"tangent": True, "tuy": True, "least_transmission": False, "margin": False}.items():
         there = getattr(settings, {"tuy": "tuy_width"}.get(option, option))
         assert getattr(options, option) == pytest.approx(np.degrees(there) if degrees else there), option
-    for option in ("quanta", "blur", "seed", "sweeps", "room", "exact"):
+    for option in ("quanta", "blur", "seed", "sweeps", "room", "uncertainty", "draws"):
         assert getattr(options, option) == getattr(settings, option), option
 
 

@@ -312,6 +312,13 @@ class TestBadInput:
         with pytest.raises(InputError, match="no edge"):
             probe(clean, points, normals)
 
+    @pytest.mark.parametrize("away", [300.0, -300.0])
+    def test_probing_far_from_the_volume(self, clean, balls, away):
+        """The splines of no voxels at all were once calculated here, beyond the end of an array."""
+        points, normals = sphere_pattern(balls[1][0], R * V, 50)
+        with pytest.raises(InputError, match="within the volume or near it"):
+            probe(clean, points + [away, 0.0, away], normals)
+
     def test_probing_with_normals_turned_round(self, clean, balls):
         points, normals = sphere_pattern(balls[1][0], R * V, 50)
         with pytest.raises(InputError, match="no edge"):

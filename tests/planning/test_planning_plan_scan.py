@@ -41,8 +41,8 @@ def test_a_part_becomes_poses_matrices_and_an_uncertainty_of_each_length():
 @pytest.mark.slow
 def test_an_exact_uncertainty_is_asked_for_and_stated():
     how = {"views": 6, "mu_per_mm": 0.05, "scanner": SCANNER, "features": sides(), "options": COARSE}
-    found, filters = (tp.plan_scan(box_part().mesh, **how, exact_uncertainty=exact) for exact in (True, False))
-    assert found.document["constants"]["exact_uncertainty"] is True
+    found, filters = (tp.plan_scan(box_part().mesh, **how, uncertainty=way) for way in ("exact", "filters"))
+    assert found.document["constants"]["uncertainty"] == "exact"
     assert found.J == filters.J
     assert found.u_mm["width"] != filters.u_mm["width"]
     assert found.u_mm["width"] == pytest.approx(filters.u_mm["width"], rel=0.5)

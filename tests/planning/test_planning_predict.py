@@ -149,9 +149,9 @@ def test_the_exact_prediction_is_near_that_by_filters_and_falls_with_the_quanta(
         goal = replace(setting.goal(), settings=replace(setting.settings, **changed))
         return predicted(goal, setting.scanner, P, table(goal, P), plan=features, response=response)[1]["height"]
 
-    exact = height(exact=True)
+    exact = height(uncertainty="exact")
     assert exact / height() == pytest.approx(1.0, abs=0.35)
-    assert exact / height(exact=True, quanta=8.0e4) == pytest.approx(2.0, rel=1e-6)
+    assert exact / height(uncertainty="exact", quanta=8.0e4) == pytest.approx(2.0, rel=1e-6)
     noisier = sart_steps(setting.part, setting.scanner, P, setting.settings)
     assert height(replace(noisier, variance=9 * noisier.variance)) == pytest.approx(3 * exact, rel=1e-6)
 
@@ -211,7 +211,7 @@ def test_four_times_the_quanta_halve_the_uncertainty():
     u = []
     for quanta in (2e4, 8e4):
         goal = replace(setting.goal(), settings=replace(setting.settings, quanta=quanta))
-        targets, lengths = predicted(goal, setting.scanner, P, table(goal, P), plan=features)
+        targets, lengths, _ = predicted(goal, setting.scanner, P, table(goal, P), plan=features)
         u.append([*(t.u for t in targets), lengths["height"]])
     assert all(math.isfinite(x) for x in u[0])
     np.testing.assert_allclose(np.array(u[0]) / u[1], 2.0, rtol=1e-6)

@@ -126,12 +126,13 @@ def scan_plan() -> str:
         "J": 0.61, "C": 0.7, "T": 0.5, "M": 0.55, "worst_transmission": 0.02, "largest_gap_deg": 31.0,
         "travel": 412.0, "duration_s": 300.0, "views_out_of_view": 0,
         "features": [{"name": "bore", "seen_share": 0.9, "u_mm": 0.001}],
+        "lengths": [{"name": "width", "u_mm": None, "draws_measured": 3, "relative_u_of_u": 0.5}],
     }  # fmt: skip
     document = {
         **figures, "part": "part.stl", "views": 30, "candidates": 400, "certificate": {"ratio": 0.97},
         "paths": {"circle": {**figures, "J": 0.5}}, "unseen": [{"name": "bore", "why": "no ray runs along it"}],
         "transmission_by_view": [0.5] * 30, "limits": {"x_mm": [-10.0, 10.0]}, "assumed_limits": ["x_mm"],
-        "constants": {"graze_deg": 3.0}, "attenuation": "Al, 0.05 per mm",
+        "constants": {"graze_deg": 3.0, "uncertainty": "drawn", "draws": 20}, "attenuation": "Al, 0.05 per mm",
         "joints": [{"joint": 1, "unit": "deg", "lowest": -31.0, "highest": 28.0, "limits": [-90.0, 90.0]}],
         "freedoms": [{"name": "tilt of 10 degrees", "J": 0.66, "gain": 0.05}],
     }  # fmt: skip

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from tomopose import Calibration, PoseSequence, Scanner
     from tomopose.manipulator.hexapod import Hexapod
     from tomopose.manipulator.serial import SerialRobot
-    from tomopose.planning.part.settings import PartSettings
+    from tomopose.planning.part.part import Part
+    from tomopose.planning.part.settings import PartSettings, Uncertainty
     from tomopose.planning.part_scan.freedoms import Freedom, Placing
     from tomopose.planning.part_scan.plan import PartScanPlan
     from tomopose.provenance import Provenance
@@ -111,12 +112,15 @@ class PartOptions:
     room: Annotated[
         float, typer.Option("--room-mm", help="By how much the reconstructed box exceeds the part on each side.")
     ] = 5.0
-    exact: Annotated[
-        bool,
+    uncertainty: Annotated[
+        str,
         typer.Option(
-            "--exact-uncertainty", help="Predict through SART's own steps: about a reconstruction for each length."
+            "--uncertainty",
+            help="How lengths are predicted: filters (seconds), exact (SART's own steps, a reconstruction for each "
+            "length) or drawn (scans with drawn noise, a reconstruction for each; knows the beam of --kv or --scene).",
         ),
-    ] = False
+    ] = "filters"
+    draws: Annotated[int, typer.Option("--draws", min=10, help="Scans that are drawn for --uncertainty drawn.")] = 100
     manipulator: Annotated[
         Path | None,
         typer.Option("--manipulator", help="hexapod.json or robot.json: its legs or joints keep to their stroke."),
@@ -238,7 +242,21 @@ def _attenuation(o: Options) -> tuple[float, str]:
     return mu, f"{mu:.4g} /mm of {o.material} at {energy:.1f} keV, the mean of a tube at {kv:g} kV ({said})"
 
 
-def _settings(o: Options, mu: float) -> PartSettings:
+def _beam(o: Options, part: Part) -> tuple[tuple[float, float], ...]:
+    """(share, 1/mm) of the energies of the beam that --kv or --scene says; empty where only mu is known."""
+    from tomopose.simulation.physics.materials import MATERIALS
+    from tomopose.simulation.physics.spectrum import condense, tube_spectrum
+    from tomopose.simulation.scene.build import beam
+    from tomopose.simulation.scene.scene import read_scene
+
+    if o.material is None or (o.kv is None and o.scene is None):
+        return ()
+    known = (tube_spectrum(cast("float", o.kv)), MATERIALS) if o.scene is None else beam(read_scene(o.scene))
+    found = condense(known[0], (o.material,), [part.mesh.size], known[1])
+    return tuple((float(w), float(mu)) for w, mu in zip(found.w, found.mu[:, 0], strict=True))
+
+
+def _settings(o: Options, mu: float, part: Part) -> PartSettings:
     from tomopose.planning.part.settings import PartSettings
 
     return PartSettings(
@@ -252,7 +270,9 @@ def _settings(o: Options, mu: float) -> PartSettings:
         blur=o.blur,
         sweeps=o.sweeps,
         room=o.room,
-        exact=o.exact,
+        uncertainty=cast("Uncertainty", o.uncertainty),
+        draws=o.draws,
+        beam=_beam(o, part) if o.uncertainty == "drawn" else (),
         seed=o.seed,
     )
 
@@ -299,11 +319,12 @@ def _planned(o: Options) -> int:
         require_absent(path, force=o.force)
     cal = None if o.calibration is None else tp.read_calibration(o.calibration)
     mu, source = _attenuation(o)
+    part = read_part(o.part)
     setting = Setting(
         scanner=_scanner(o, cal),
-        part=read_part(o.part),
+        part=part,
         views=VIEWS_OF_A_PART if o.views is None else o.views,
-        settings=_settings(o, mu),
+        settings=_settings(o, mu, part),
         features=None if o.features is None else read_plan(o.features),
         limits=ScanLimits() if o.limits is None else read_limits(o.limits),
         calibration=cal,

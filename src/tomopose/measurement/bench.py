@@ -41,8 +41,11 @@ def sphere_name(k: int) -> str:
 class Bench:
     """One volume on the measuring table: what several features share is worked out once."""
 
-    def __init__(self, volume: Volume, plan: MeasurementPlan) -> None:
+    def __init__(self, volume: Volume, plan: MeasurementPlan, *, reach: float = CORRELATION_VOXELS) -> None:
+        """reach: voxels over which the fits look for correlation; at 0 points count as independent, which is faster and
+        leaves values as they are, but not their uncertainty."""
         self.volume, self.plan = volume, plan
+        self._reach = reach * float(volume.grid.spacing.max())
         self.notes: list[str] = []
         s = plan.surface
         if (s.background is None) != (s.material is None):
@@ -160,10 +163,9 @@ class Bench:
 
     def _fitted(self, plan: FeaturePlan, alignment: Alignment, points: Array, area: Array | None) -> Feature:
         direction = None if plan.direction is None else alignment.directions(plan.direction)
-        reach = CORRELATION_VOXELS * float(self.volume.grid.spacing.max())
         held = plan.radius_mm if plan.fixed_radius else None
         return by_reference(
-            _fit(plan.kind, points, area, outliers=plan.outliers, reach=reach, direction=direction, held=held),
+            _fit(plan.kind, points, area, outliers=plan.outliers, reach=self._reach, direction=direction, held=held),
             plan.reference,
         )
 

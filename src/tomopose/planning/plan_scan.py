@@ -18,12 +18,15 @@ from tomopose.manipulator.serial import SerialRobot
 from tomopose.measurement.mesh.mesh import Mesh
 from tomopose.measurement.plan import MeasurementPlan
 from tomopose.planning.part.part import Part, read_part, require_simple
-from tomopose.planning.part.settings import PartSettings
+from tomopose.planning.part.settings import PartSettings, Uncertainty
 from tomopose.planning.part_scan.limits_file import ScanLimits, read_limits
 from tomopose.planning.part_scan.plan import plan_part_scan
 from tomopose.planning.part_scan.setting import Setting
 from tomopose.planning.part_scan.summary import plan_document
 from tomopose.values import require_types, value
+
+OWN = ("mu", "uncertainty", "draws", "beam")
+"""Settings that are no numbers, or have an argument of their own."""
 
 
 @value
@@ -61,7 +64,8 @@ def plan_scan(
     limits: str | Path | None = None,
     manipulator: Hexapod | SerialRobot | None = None,
     continuous: bool = False,
-    exact_uncertainty: bool = False,
+    uncertainty: Uncertainty = "filters",
+    draws: int = 100,
     options: Mapping[str, float] | None = None,
 ) -> ScanPlan:
     """Choose `views` table angles and plate poses that show a part best.
@@ -74,7 +78,8 @@ def plan_scan(
     manipulator: a hexapod or a robot whose legs or joints have to stay within their stroke; a robot's poses are counted
                  from its working pose, where the part lies in W, and come with their joint values.
     continuous:  whether the views lie on one smooth turn.
-    exact_uncertainty: whether u_mm is predicted through SART's own steps; about a reconstruction for each length.
+    uncertainty: how u_mm is predicted: "filters" in seconds; "exact", through SART's own steps, about a reconstruction
+                 for each length; "drawn", the scatter of `draws` scans with noise, a reconstruction for each.
     options:     of the objective and the prediction: least_transmission, tangent (rad), tuy_width (rad), margin (px),
                  quanta, readout, blur (px), sweeps, room (mm), alpha_step and tilt_step (rad), seed ...
 
@@ -88,16 +93,16 @@ def plan_scan(
     if scanner is not None and calibration is not None:
         require_same_scanner(calibration, scanner)
     given = dict(options or {})
-    unknown = sorted(set(given) - (set(PartSettings.__dataclass_fields__) - {"mu", "exact"}))
+    known = [k for k in PartSettings.__dataclass_fields__ if k not in OWN]
+    unknown = sorted(set(given) - set(known))
     if unknown:
-        known = ", ".join(k for k in PartSettings.__dataclass_fields__ if k not in ("mu", "exact"))
-        raise InputError(f"options: {', '.join(unknown)} is not known; {known} are")
+        raise InputError(f"options: {', '.join(unknown)} is not known; {', '.join(known)} are")
     whole = {k: int(v) if k in ("sweeps", "seed") and float(v).is_integer() else v for k, v in given.items()}
     setting = Setting(
         scanner=scanner if calibration is None else calibration.scanner,  # type: ignore[arg-type]
         part=_part(part),
         views=views,
-        settings=PartSettings(mu=mu_per_mm, exact=exact_uncertainty, **whole),  # type: ignore[arg-type]
+        settings=PartSettings(mu=mu_per_mm, uncertainty=uncertainty, draws=draws, **whole),  # type: ignore[arg-type]
         features=features,
         limits=ScanLimits() if limits is None else read_limits(limits),
         calibration=calibration,

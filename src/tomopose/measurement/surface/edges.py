@@ -42,6 +42,8 @@ class EdgeFlag(IntFlag):
 
 
 LAYERS = 128
+FEWEST_VOXELS = 4
+"""Along each axis of the part of a volume that edges are searched in."""
 SIGMA_SAMPLE, SIGMA_ROUNDS, SIGMA_TOLERANCE = 3000, 40, 2e-5
 SIGMA_RANGE = (0.3, 4.0)
 START_SIGMA = 1.0
@@ -195,7 +197,7 @@ def _piece(
     reach = settings.search_distance + 2 + window + max(window, longer + 2.5 * sigma + 1)
     reach = reach * np.abs(step).max(axis=0)
     low, high = _part(index, reach, volume.grid.shape)
-    if (high - low < 4).any():
+    if (high - low < FEWEST_VOXELS).any():
         return np.full((len(index), kernel.N_COLUMNS), np.nan), np.full(len(index), kernel.BORDER, dtype=np.uint8)
     part = volume.values[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
     coefficients = spline_coefficients(part)
@@ -223,6 +225,11 @@ def _estimated_sigma(volume: Volume, index: Array, step: Array, settings: EdgeSe
     rows = rows[:: max(len(rows) // SIGMA_SAMPLE, 1)]
     reach = (settings.search_distance + 2 * fit_window(settings, SIGMA_RANGE[1]) + 2) * np.abs(step).max(axis=0)
     low, high = _part(index[rows], reach, volume.grid.shape)
+    if (high - low < FEWEST_VOXELS).any():
+        raise InputError(
+            f"none of {len(rows)} points looked at lies within the volume or near it; check their place, the unit and "
+            "the alignment"
+        )
     coefficients = spline_coefficients(volume.values[low[0] : high[0], low[1] : high[1], low[2] : high[2]])
 
     def edges(sigma: float) -> tuple[Array, np.ndarray]:

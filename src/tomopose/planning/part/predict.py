@@ -7,6 +7,7 @@ measurand takes these to a length:
 
 so that a length is one sum over grey levels of the volume, whose variance `SartResponse.covariance` gives by filters,
 or `SartSteps.covariance` through SART's own steps, with all correlation between voxels, points and the two features.
+A third prediction takes nothing as linear: the scatter of drawn scans (`drawn`).
 What it holds: the quanta and the readout, the views' geometry and transmission, blur, SART, the fit; and, with a
 calibration, its shared uncertainty.  What it does not hold: every systematic deviation (artefacts of few views and of
 the cone beam, beam hardening, scatter, sampling by voxels).
@@ -14,8 +15,9 @@ the cone beam, beam hardening, scatter, sampling by voxels).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array, hstack, vstack
@@ -27,6 +29,7 @@ from tomopose.measurement.features.feature import Feature
 from tomopose.measurement.features.shapes import frame_along
 from tomopose.measurement.measure import evaluate
 from tomopose.measurement.plan import MeasurandPlan, MeasurementPlan
+from tomopose.planning.part.drawn import drawn_scans, scatter, scatter_of_place
 from tomopose.planning.part.expected_edges import FEWEST_EDGES, ExpectedEdges, expected_edges
 from tomopose.planning.part.sart_response import SartResponse, sart_response
 from tomopose.planning.part.sart_steps import SartSteps, sart_steps
@@ -59,6 +62,19 @@ class Predicted:
     without_best: float
 
 
+class Prediction(NamedTuple):
+    """features: each target;  lengths: standard uncertainty, mm, of each distance and diameter of the plan;
+    measured: how many of the drawn scans show each of these, where scans were drawn."""
+
+    features: list[Predicted]
+    lengths: dict[str, float]
+    measured: dict[str, int]
+
+
+def _silent(_: str) -> None:
+    return None
+
+
 def predicted(
     goal: Goal,
     scanner: Scanner,
@@ -68,13 +84,18 @@ def predicted(
     plan: MeasurementPlan | None = None,
     shared: Array | None = None,
     response: SartResponse | SartSteps | None = None,
-) -> tuple[list[Predicted], dict[str, float]]:
-    """(each target, standard uncertainty in mm of each distance and diameter of the plan).
+    progress: Callable[[str], None] = _silent,
+) -> Prediction:
+    """What the noise of views with matrices P (n, 3, 4) lets expect, in the way that the settings say.
 
     shared: (targets,) mm, what the calibration adds to the place of each, in quadrature.  response: what SART makes of
-    the views; unless given, of the part alone, by filters or, where the settings say so, exactly.
+    the views, in place of what it makes of the part alone;  progress: is given a line now and then.
     """
-    u, sizes, lengths = _from_noise(goal, scanner, P, plan, response)
+    measured: dict[str, int] = {}
+    if goal.settings.uncertainty == "drawn" and response is None:
+        u, sizes, lengths, measured = _from_draws(goal, scanner, P, plan, progress)
+    else:
+        u, sizes, lengths = _from_noise(goal, scanner, P, plan, response)
     own = np.zeros(len(goal.targets)) if shared is None else shared
     out = []
     for k, target in enumerate(goal.targets):
@@ -95,7 +116,32 @@ def predicted(
     for m in () if plan is None else plan.measurands:
         if m.kind == "distance" and m.name in lengths:
             lengths[m.name] = float(np.linalg.norm([lengths[m.name], *(by[f] for f in m.of)]))
-    return out, lengths
+    return Prediction(out, lengths, measured)
+
+
+def _in_front(goal: Goal, P: Array) -> bool:
+    """Whether the whole part lies between source and panel in all views, so that there are images of it."""
+    depth = goal.part.hull @ P[:, 2, :3].T + P[:, 2, 3]
+    return bool((depth > 0).all())
+
+
+def _from_draws(
+    goal: Goal, scanner: Scanner, P: Array, plan: MeasurementPlan | None, progress: Callable[[str], None]
+) -> tuple[Array, Array, dict[str, float], dict[str, int]]:
+    """As `_from_noise`, from drawn scans, and how many of them show each length."""
+    targets, asked = goal.targets, None
+    if plan is not None and plan.features:
+        wanted = tuple(m for m in plan.measurands if m.kind in PREDICTED and set(m.of) <= plan.features.keys())
+        asked = plan.model_copy(update={"measurands": wanted, "spheres": None})
+    names = () if asked is None else tuple(m.name for m in asked.measurands)
+    if not _in_front(goal, P):
+        nothing = np.full(len(targets), np.inf)
+        return nothing, nothing, dict.fromkeys(names, np.inf), dict.fromkeys(names, 0)
+    scans = drawn_scans(goal, scanner, P, plan=asked, progress=progress)
+    u = np.array([scatter_of_place(t, scans.points[t.name]) for t in targets])
+    sizes = np.array([scatter(scans.radii[t.name]) if t.name in scans.radii else np.nan for t in targets])
+    lengths = {name: scatter(x) for name, x in scans.lengths.items()}
+    return u, sizes, lengths, {name: int(np.isfinite(x).sum()) for name, x in scans.lengths.items()}
 
 
 def _from_noise(
@@ -110,12 +156,12 @@ def _from_noise(
         goal = replace(goal, targets=probed_targets(plan, PROBED))
     targets = goal.targets
     wanted = () if plan is None else _lengths(targets, plan)
-    depth = goal.part.hull @ P[:, 2, :3].T + P[:, 2, 3]
-    if not (depth > 0).all():
+    if not _in_front(goal, P):
         nothing = np.full(len(targets), np.inf)
         return nothing, nothing, {m.name: np.inf for m in wanted}
     if response is None:
-        response = (sart_steps if goal.settings.exact else sart_response)(goal.part, scanner, P, goal.settings)
+        exact = goal.settings.uncertainty == "exact"
+        response = (sart_steps if exact else sart_response)(goal.part, scanner, P, goal.settings)
     edges = {t.name: expected_edges(response, t.x, t.n) for t in targets}
     rows: list[csr_array] = []
     for target in targets:

@@ -132,7 +132,7 @@ def blocks(part: Part, scanner: Scanner, P: Array, settings: PartSettings, *, co
     crop[:, :2, 2] = -(size - 1) / 2 / size - low
     crop[:, 2, 2] = 1.0
     P = crop @ P
-    tau = np.stack([_transmission(part, p, (n_v, n_u), settings.mu) for p in P])
+    tau = np.stack([_transmission(part, p, (n_v, n_u), settings) for p in P])
     tau = np.maximum(gaussian_filter(tau, (0, settings.blur / size, settings.blur / size)), 1e-12)
     quanta = settings.quanta * size**2 * tau
     depth = float(np.mean(P[:, 2, :3] @ part.centre + P[:, 2, 3]))
@@ -162,14 +162,14 @@ def sart_response(part: Part, scanner: Scanner, P: Array, settings: PartSettings
     )
 
 
-def _transmission(part: Part, P: Array, shape: tuple[int, int], mu: float) -> Array:
+def _transmission(part: Part, P: Array, shape: tuple[int, int], settings: PartSettings) -> Array:
     """(n_v, n_u) mean transmission of the pixels of a view P (3, 4)."""
     v, u = (np.arange(k * CELLS) / CELLS - 0.5 + 0.5 / CELLS for k in shape)
     rays = np.stack([*np.meshgrid(u, v), np.ones((len(v), len(u)))], axis=-1).reshape(-1, 3)
     depth = float(P[2, :3] @ part.centre + P[2, 3])
     x = (depth * rays - P[:, 3]) @ np.linalg.inv(P[:, :3]).T
     L, _ = material_paths(P[None], part.mesh.points, part.mesh.faces, x)
-    tau = np.exp(-mu * np.maximum(L[0], 0.0)).reshape(shape[0], CELLS, shape[1], CELLS)
+    tau = settings.transmission(L[0]).reshape(shape[0], CELLS, shape[1], CELLS)
     mean: Array = tau.mean(axis=(1, 3))
     return mean
 

@@ -30,7 +30,7 @@ from tomopose.geometry.scanner import Scanner
 from tomopose.kernel_cache import njit
 from tomopose.measurement.surface.splines import spline_coefficients, spline_value
 from tomopose.planning.part.part import Part
-from tomopose.planning.part.sart_response import RELAXATION, blocks
+from tomopose.planning.part.sart_response import RELAXATION, Blocks, blocks
 from tomopose.planning.part.settings import PartSettings
 from tomopose.trajectory.view_order import view_order
 from tomopose.units import Array
@@ -81,17 +81,10 @@ class SartSteps:
 
 
 def sart_steps(part: Part, scanner: Scanner, P: Array, settings: PartSettings) -> SartSteps:
-    """Of views with matrices P (n, 3, 4), part at home -> pixels; voxels of a block's size at the part."""
-    half = np.ptp(part.mesh.points, axis=0) / 2 + settings.room
-    found = blocks(part, scanner, P, settings, corners=part.centre + half * BOX_CORNERS)
-    n_v, n_u = found.tau.shape[1:]
-    names = tuple(str(j) for j in range(len(P)))
-    matrices = ProjectionMatrices(
-        P=found.P, n_u=n_u, n_v=n_v, p_u=scanner.p_u * found.size, p_v=scanner.p_v * found.size, pose_id=names
-    )
-    n = np.maximum(np.ceil(2 * half / found.voxel), 4).astype(int)
-    box = VoxelGrid((int(n[2]), int(n[1]), int(n[0])), found.voxel, part.centre)
-    values = _volume(matrices, box, -np.log(found.tau), settings.sweeps)
+    """Of views with matrices P (n, 3, 4), part at home -> pixels."""
+    found, matrices, box = planned_scan(part, scanner, P, settings)
+    engine = CpuEngine(matrices, box)
+    values = sart(engine, relaxed_per_length(engine), -np.log(found.tau), settings.sweeps)
     return SartSteps(
         matrices=matrices,
         variance=found.variance,
@@ -101,16 +94,31 @@ def sart_steps(part: Part, scanner: Scanner, P: Array, settings: PartSettings) -
     )
 
 
+def planned_scan(
+    part: Part, scanner: Scanner, P: Array, settings: PartSettings
+) -> tuple[Blocks, ProjectionMatrices, VoxelGrid]:
+    """(expected images, their matrices, the reconstructed box) of views with matrices P (n, 3, 4), part at home ->
+    pixels; voxels of a block's size at the part."""
+    half = np.ptp(part.mesh.points, axis=0) / 2 + settings.room
+    found = blocks(part, scanner, P, settings, corners=part.centre + half * BOX_CORNERS)
+    n_v, n_u = found.tau.shape[1:]
+    names = tuple(str(j) for j in range(len(P)))
+    matrices = ProjectionMatrices(
+        P=found.P, n_u=n_u, n_v=n_v, p_u=scanner.p_u * found.size, p_v=scanner.p_v * found.size, pose_id=names
+    )
+    n = np.maximum(np.ceil(2 * half / found.voxel), 4).astype(int)
+    return found, matrices, VoxelGrid((int(n[2]), int(n[1]), int(n[0])), found.voxel, part.centre)
+
+
 def relaxed_per_length(engine: CpuEngine) -> Array:
     """(n, n_v, n_u) w / L; 0 where the ray has too little of the grid."""
     L = engine.lengths(range(len(engine.matrices))).astype(np.float64)
     return np.asarray(RELAXATION * per_length(L, engine.grid))
 
 
-def _volume(matrices: ProjectionMatrices, box: VoxelGrid, p: Array, sweeps: int) -> np.ndarray:
-    """[z, y, x] 1/mm, that SART makes of line integrals p (n, n_v, n_u)."""
-    engine = CpuEngine(matrices, box)
-    state, per_mm = engine.empty(), relaxed_per_length(engine)
+def sart(engine: CpuEngine, per_mm: Array, p: Array, sweeps: int) -> np.ndarray:
+    """[z, y, x] 1/mm, that SART makes of line integrals p (n, n_v, n_u); per_mm: as of `relaxed_per_length`."""
+    state = engine.empty()
     for _ in range(sweeps):
         for j in (int(j) for j in view_order(len(p))):
             residual = (p[j] - engine.forward(state, [j])[0]) * per_mm[j]

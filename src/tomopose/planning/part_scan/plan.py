@@ -32,7 +32,8 @@ Progress = Callable[[str], None]
 class Judged:
     """A path with what it is worth on points that nothing was planned with.
 
-    q: (n, 7) axes, mm and rad;  travel: mm + deg;  duration: s;  tau: (n,) mean transmission of each view;
+    q: (n, 7) axes, mm and rad;  lengths: u, mm;  measured: how many drawn scans show each, where scans were drawn;
+    travel: mm + deg;  duration: s;  tau: (n,) mean transmission of each view;
     seen: (m,) how many views show each point that it was judged on;
     out_of_view: views in which the part leaves the panel or hits an obstacle; those are counted as if they did not.
     """
@@ -41,6 +42,7 @@ class Judged:
     worth: Worth
     features: tuple[Predicted, ...]
     lengths: Mapping[str, float]
+    measured: Mapping[str, int]
     travel: float
     duration: float
     tau: Array
@@ -137,14 +139,14 @@ def plan_part_scan(setting: Setting, *, progress: Progress = _silent) -> PartSca
         q, dropped = _within_time(machine, setting.limits, goal, q, fine)
     way = fine_path(machine, q) if setting.continuous else None
     progress("judging the plan and the usual paths on other points")
-    judge = _Judge(goal=setting.goal(judged=True), machine=machine, setting=setting)
+    judge = _Judge(goal=setting.goal(judged=True), machine=machine, setting=setting, progress=progress)
     return PartScanPlan(
         poses=machine.commanded(q),
         planned_J=reached,
         bound=bound,
         candidates=len(q_all),
-        chosen=judge(q),
-        paths={name: judge(path) for name, path in usual_paths(machine, len(q)).items()},
+        chosen=judge("plan", q),
+        paths={name: judge(name, path) for name, path in usual_paths(machine, len(q)).items()},
         unseen=_unseen(goal, tables),
         goal=judge.goal,
         settings=setting.settings,
@@ -204,8 +206,9 @@ class _Judge:
     goal: Goal
     machine: Machine
     setting: Setting
+    progress: Progress
 
-    def __call__(self, q: Array) -> Judged:
+    def __call__(self, name: str, q: Array) -> Judged:
         P, goal = self.machine.matrices(q), self.goal
         time_of = turn_duration if self.setting.continuous else duration
         views = table(goal, P)
@@ -217,12 +220,21 @@ class _Judge:
             sigma = matrices.points_sigma_shared
             assert sigma is not None
             shared = shared_part(goal, self.machine.scanner, P, np.asarray(sigma).reshape(-1, len(x)).mean(axis=0))
-        found, lengths = predicted(goal, self.machine.scanner, P, views, plan=self.setting.features, shared=shared)
+        found = predicted(
+            goal,
+            self.machine.scanner,
+            P,
+            views,
+            plan=self.setting.features,
+            shared=shared,
+            progress=lambda line: self.progress(f"{name}: {line}"),
+        )
         return Judged(
             q=q,
             worth=worth(goal, P, views),
-            features=tuple(found),
-            lengths=lengths,
+            features=tuple(found.features),
+            lengths=found.lengths,
+            measured=found.measured,
             travel=travel(self.machine, q),
             duration=time_of(self.machine, self.setting.limits.time, q),
             tau=views.M,

@@ -44,8 +44,16 @@ def _judged(j: Judged) -> Content:
             }
             for f in j.features
         ],
-        "lengths": [{"name": name, "u_mm": _finite(u)} for name, u in j.lengths.items()],
+        "lengths": [{"name": name, "u_mm": _finite(u), **_drawn(j, name)} for name, u in j.lengths.items()],
     }
+
+
+def _drawn(j: Judged, name: str) -> Content:
+    """Of a length: how many drawn scans show it, and the relative uncertainty that so many leave its u."""
+    if name not in j.measured:
+        return {}
+    n = j.measured[name]
+    return {"draws_measured": n, "relative_u_of_u": 1 / math.sqrt(2 * (n - 1)) if n > 1 else None}
 
 
 def _constants(s: PartSettings) -> Content:
@@ -64,7 +72,9 @@ def _constants(s: PartSettings) -> Content:
         "blur_px": s.blur,
         "sweeps": s.sweeps,
         "room_mm": s.room,
-        "exact_uncertainty": s.exact,
+        "uncertainty": s.uncertainty,
+        "draws": s.draws if s.uncertainty == "drawn" else None,
+        "beam_energies": len(s.beam) or 1,
         "seed": s.seed,
     }
 
@@ -124,6 +134,7 @@ def plan_lines(plan: PartScanPlan) -> list[str]:
         w = j.worth
         out = f"; {j.out_of_view} views out of view" if j.out_of_view else ""
         lines.append(f"  {name:<9}{w.J:7.3f}{w.C:7.3f}{w.T:7.3f}{w.M:7.3f}{j.travel:8.0f}{out}")
+    lines += _uncertainty_lines(plan)
     lines += [f"  {name}: {why}" for name, why in plan.unseen.items()]
     if plan.way is not None and plan.way_blocked:
         lines.append(
@@ -135,3 +146,16 @@ def plan_lines(plan: PartScanPlan) -> list[str]:
             f"  {plan.dropped[0]} views left out to keep the time limit; they would have added {plan.dropped[1]:.4f}"
         )
     return lines
+
+
+def _uncertainty_lines(plan: PartScanPlan) -> list[str]:
+    """Which lengths have no predicted uncertainty, and which are missing from some of the drawn scans."""
+    s, out = plan.settings, []
+    for name, u in plan.chosen.lengths.items():
+        n = plan.chosen.measured.get(name, s.draws)
+        if n < s.draws:
+            given = "no uncertainty is predicted" if not math.isfinite(u) else "its uncertainty is that of these"
+            out.append(f"  {name}: measured in {n} of {s.draws} drawn scans; {given}")
+        elif not math.isfinite(u):
+            out.append(f"  {name}: no edge is to be expected at one of its features; no uncertainty is predicted")
+    return out

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 
@@ -29,6 +29,14 @@ class FeatureFigures(TypedDict):
     u_mm: float | None
 
 
+class LengthFigures(TypedDict):
+    """Of a length along one path; u_mm None where nothing is predicted; draws_measured where scans were drawn."""
+
+    name: str
+    u_mm: float | None
+    draws_measured: NotRequired[int]
+
+
 class PathFigures(TypedDict):
     """What scan.json says of one path."""
 
@@ -42,6 +50,7 @@ class PathFigures(TypedDict):
     duration_s: float
     views_out_of_view: int
     features: list[FeatureFigures]
+    lengths: list[LengthFigures]
 
 
 class Certificate(TypedDict):
@@ -154,7 +163,7 @@ def scan_plan_report(
                 Section(
                     title="Beside the usual paths",
                     lead="The same number of views, within the same limits, judged on the same points.",
-                    blocks=[_paths(document), _features(document), _transmission(document)],
+                    blocks=[_paths(document), _features(document), *_lengths(document), _transmission(document)],
                 ),
                 Section(title="What limits it", lead="Each freedom was tried by itself.", blocks=_limits(document)),
                 Section(title="Definitions", blocks=[_constants(document)]),
@@ -271,12 +280,45 @@ def _features(document: ScanPlanFigures) -> Table:
         title="Features",
         meaning=(
             "Share of the feature that is seen, and the standard uncertainty of its position that the views' noise "
-            "lets expect after SART and the fit. Systematic deviations (few views, cone beam, beam hardening, "
-            "scatter) are not in it."
+            f"lets expect after SART and the fit, {_predicted_by(document)}. Systematic deviations (few views, cone "
+            "beam, beam hardening, scatter) are not in it."
         ),
         columns=["feature", *(name for name, _ in paths)],
         rows=rows,
     )
+
+
+def _predicted_by(document: ScanPlanFigures) -> str:
+    """How u was predicted."""
+    constants = document["constants"]
+    return {
+        "filters": "predicted by filters in the place of SART's steps",
+        "exact": "predicted through SART's own steps",
+        "drawn": f"the scatter of {constants['draws']} scans with drawn noise",
+    }[str(constants["uncertainty"])]
+
+
+def _lengths(document: ScanPlanFigures) -> list[Block]:
+    paths, draws = _all(document), document["constants"]["draws"]
+    if not document["lengths"]:
+        return []
+    rows = [
+        [length["name"], *(_length(p["lengths"][k], draws) for _, p in paths)]
+        for k, length in enumerate(document["lengths"])
+    ]
+    table = Table(
+        title="Lengths",
+        meaning=f"Standard uncertainty of each length from the views' noise alone, {_predicted_by(document)}.",
+        columns=["length", *(name for name, _ in paths)],
+        rows=rows,
+    )
+    return [table]
+
+
+def _length(length: LengthFigures, draws: object) -> str:
+    u, n = length["u_mm"], length.get("draws_measured")
+    said = "not predicted" if u is None else f"{number(1000 * u)} um"
+    return said if n is None or n == draws else f"{said}; measured in {n} of {draws} draws"
 
 
 def _transmission(document: ScanPlanFigures) -> Figure:
