@@ -90,6 +90,15 @@ def test_a_fit_that_no_pixel_judges_is_not_determined():
     assert "held_out" in reasons[0]
 
 
+@pytest.mark.parametrize("chi", [1.4, 14.0])
+def test_a_correction_kept_beside_residuals_above_noise_says_that_its_uncertainty_does_not_hold(chi):
+    n = np.zeros(3)
+    gained = Trial(before=n, after=n, pixels=90, gain=8.9, residual_before=n, residual_after=n)
+    verdict, reasons = decide(Evidence(held_out=gained, chi=chi, faces=(), left=1.0, edges=(), open_=(), moved=3.4))
+    assert verdict is Verdict.REFINED
+    assert any("14.0 times the images' noise" in r for r in reasons) is (chi > 2)
+
+
 def test_preconditioned_turns_come_nearer_to_the_solution_than_as_many_plain_ones():
     m = matrices()
     projector = Workers(threads=1).projector(m, GRID)

@@ -153,7 +153,13 @@ def decide(e: Evidence) -> tuple[Verdict, tuple[str, ...]]:
             f"The correction is {e.moved:.1f} times its own standard uncertainty, {OWN_SIGMA:g} are needed: it would "
             "add as much error as it removes",
         )
+    finer = (
+        f"The residual is {e.chi:.1f} times the images' noise: the images show more than these voxels can hold. That "
+        "moves poses too, which neither the stated uncertainty nor the two halves know: compare a length or an edge in "
+        "both volumes before you use the matrices"
+    )
     return Verdict.REFINED, (
         f"Pixels kept out of the fit agree: they gain {e.held_out.gain:.1f} standard errors",
         f"The correction is {e.moved:.1f} times its own standard uncertainty",
+        *((finer,) if e.chi > MISFIT else ()),
     )
