@@ -199,8 +199,8 @@ def predictions(case: Case, task: Setting, scan: VirtualScan, ways: Sequence[str
 
 def beam(case: Case) -> tuple[tuple[float, float], ...]:
     """Share and attenuation of the energies of the tube that the scan is planned for; no scatter."""
-    found = condense(tube_spectrum(TUBE_KV).filtered(*FILTER), (MATERIAL,), [case.part.mesh.size])
-    return tuple((float(w), float(mu)) for w, mu in zip(found.w, found.mu[:, 0], strict=True))
+    tube = tube_spectrum(TUBE_KV).filtered(*FILTER)
+    return condense(tube, (MATERIAL,), [case.part.mesh.size]).of_first_material
 
 
 @dataclass(frozen=True, kw_only=True)

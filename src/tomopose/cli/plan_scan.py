@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from tomopose.planning.part_scan.plan import PartScanPlan
     from tomopose.provenance import Provenance
     from tomopose.report.pages.scan_plan_page import ScanPlanFigures
+    from tomopose.simulation.physics.materials import Material
+    from tomopose.simulation.physics.spectrum import Spectrum
     from tomopose.trajectory.scan import Wave
 
 EPILOG = (
@@ -216,12 +218,23 @@ def _completeness(o: Options, cal: Calibration | None, sequence: PoseSequence) -
     return float(tuy_completeness(source_path(matrices), points).share.min())
 
 
-def _attenuation(o: Options) -> tuple[float, str]:
-    """(mu in 1/mm, where it comes from)."""
-    from tomopose.simulation.physics.materials import attenuation
+def _source(o: Options) -> tuple[Spectrum, Mapping[str, Material], str]:
+    """The scene's beam and materials, or those of a tube at --kv, and what it is, in words."""
+    from tomopose.simulation.physics.materials import MATERIALS
     from tomopose.simulation.physics.spectrum import tube_spectrum
     from tomopose.simulation.scene.build import beam
     from tomopose.simulation.scene.scene import read_scene
+
+    if o.scene is not None:
+        return *beam(read_scene(o.scene)), o.scene.name
+    kv = DEFAULT_KV if o.kv is None else o.kv
+    said = "assumed: --kv was not given" if o.kv is None else "as given"
+    return tube_spectrum(kv), MATERIALS, f"a tube at {kv:g} kV ({said})"
+
+
+def _attenuation(o: Options) -> tuple[float, str]:
+    """(mu in 1/mm, where it comes from)."""
+    from tomopose.simulation.physics.materials import attenuation
 
     if o.mu is not None:
         if o.material is not None:
@@ -231,29 +244,19 @@ def _attenuation(o: Options) -> tuple[float, str]:
         raise typer.BadParameter(
             "the part's attenuation is needed: --mu-per-mm, or --material", param_hint="--material"
         )
-    if o.scene is not None:
-        spectrum, materials = beam(read_scene(o.scene))
-        mu = float(attenuation(o.material, [spectrum.mean_energy], materials=materials)[0])
-        return mu, f"{mu:.4g} /mm of {o.material} at {spectrum.mean_energy:.1f} keV, the mean of {o.scene.name}"
-    kv = DEFAULT_KV if o.kv is None else o.kv
-    energy = tube_spectrum(kv).mean_energy
-    mu = float(attenuation(o.material, [energy])[0])
-    said = "assumed: --kv was not given" if o.kv is None else "as given"
-    return mu, f"{mu:.4g} /mm of {o.material} at {energy:.1f} keV, the mean of a tube at {kv:g} kV ({said})"
+    spectrum, materials, said = _source(o)
+    mu = float(attenuation(o.material, [spectrum.mean_energy], materials=materials)[0])
+    return mu, f"{mu:.4g} /mm of {o.material} at {spectrum.mean_energy:.1f} keV, the mean of {said}"
 
 
 def _beam(o: Options, part: Part) -> tuple[tuple[float, float], ...]:
     """(share, 1/mm) of the energies of the beam that --kv or --scene says; empty where only mu is known."""
-    from tomopose.simulation.physics.materials import MATERIALS
-    from tomopose.simulation.physics.spectrum import condense, tube_spectrum
-    from tomopose.simulation.scene.build import beam
-    from tomopose.simulation.scene.scene import read_scene
+    from tomopose.simulation.physics.spectrum import condense
 
     if o.material is None or (o.kv is None and o.scene is None):
         return ()
-    known = (tube_spectrum(cast("float", o.kv)), MATERIALS) if o.scene is None else beam(read_scene(o.scene))
-    found = condense(known[0], (o.material,), [part.mesh.size], known[1])
-    return tuple((float(w), float(mu)) for w, mu in zip(found.w, found.mu[:, 0], strict=True))
+    spectrum, materials, _ = _source(o)
+    return condense(spectrum, (o.material,), [part.mesh.size], materials).of_first_material
 
 
 def _settings(o: Options, mu: float, part: Part) -> PartSettings:

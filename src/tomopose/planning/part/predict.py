@@ -71,8 +71,11 @@ class Prediction(NamedTuple):
     measured: dict[str, int]
 
 
-def _silent(_: str) -> None:
-    return None
+Progress = Callable[[str], None]
+
+
+def silent(_: str) -> None:
+    """Progress that nobody looks at."""
 
 
 def predicted(
@@ -84,7 +87,7 @@ def predicted(
     plan: MeasurementPlan | None = None,
     shared: Array | None = None,
     response: SartResponse | SartSteps | None = None,
-    progress: Callable[[str], None] = _silent,
+    progress: Progress = silent,
 ) -> Prediction:
     """What the noise of views with matrices P (n, 3, 4) lets expect, in the way that the settings say.
 
@@ -126,7 +129,7 @@ def _in_front(goal: Goal, P: Array) -> bool:
 
 
 def _from_draws(
-    goal: Goal, scanner: Scanner, P: Array, plan: MeasurementPlan | None, progress: Callable[[str], None]
+    goal: Goal, scanner: Scanner, P: Array, plan: MeasurementPlan | None, progress: Progress
 ) -> tuple[Array, Array, dict[str, float], dict[str, int]]:
     """As `_from_noise`, from drawn scans, and how many of them show each length."""
     targets, asked = goal.targets, None

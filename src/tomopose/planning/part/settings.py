@@ -8,7 +8,7 @@ other weights up to 1 %.
 from __future__ import annotations
 
 import math
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from tomopose.units import Array
 from tomopose.values import value
 
 Uncertainty: TypeAlias = Literal["filters", "exact", "drawn"]
-UNCERTAINTIES = ("filters", "exact", "drawn")
+UNCERTAINTIES = get_args(Uncertainty)
 """By filters in the place of SART; by SART's own steps backwards; by scans with drawn noise."""
 
 FEWEST_DRAWS = 10

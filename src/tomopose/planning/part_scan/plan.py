@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from tomopose.calibration.projection_matrices import projection_matrices
 from tomopose.errors import InputError
 from tomopose.geometry.projection import ProjectionMatrices
 from tomopose.manipulator.poses import PoseSequence
-from tomopose.planning.part.predict import Predicted, predicted, shared_part, why_unseen
+from tomopose.planning.part.predict import Predicted, Progress, predicted, shared_part, silent, why_unseen
 from tomopose.planning.part.settings import WEIGHTS, PartSettings
 from tomopose.planning.part.worth import Goal, Views, Worth, table, worth
 from tomopose.planning.part_scan.choose import choose, dual_bound, value
@@ -24,8 +24,6 @@ from tomopose.planning.part_scan.stations import Machine, allowed
 from tomopose.planning.part_scan.visit import duration, travel, turn_duration, visiting_order
 from tomopose.trajectory.completeness import source_path
 from tomopose.units import Array
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -98,11 +96,7 @@ class PartScanPlan:
         return source_path(self.machine.matrices(self.chosen.q))
 
 
-def _silent(_: str) -> None:
-    return None
-
-
-def plan_part_scan(setting: Setting, *, progress: Progress = _silent) -> PartScanPlan:
+def plan_part_scan(setting: Setting, *, progress: Progress = silent) -> PartScanPlan:
     """Choose views of a part within the machine's limits.
 
     setting: what is wanted;  progress: is given a line before each stage.

@@ -145,6 +145,11 @@ class Beam:
         """Transmission (n,) of path lengths (n, m), mm."""
         return np.exp(-np.asarray(L) @ self.mu.T) @ self.w
 
+    @property
+    def of_first_material(self) -> tuple[tuple[float, float], ...]:
+        """(share, attenuation in 1/mm by the first material) of each energy."""
+        return tuple((float(w), float(mu)) for w, mu in zip(self.w, self.mu[:, 0], strict=True))
+
 
 def condense(
     spectrum: Spectrum,
